@@ -1,0 +1,1 @@
+"""CABLE-RPC: region-of-interest perception streaming, measured in true bytes, milliseconds and quality."""
