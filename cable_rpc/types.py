@@ -46,9 +46,7 @@ class CameraIntrinsics:
 
     def scaled(self, factor_x: float, factor_y: float) -> CameraIntrinsics:
         """The same camera after resizing its image by the given factors."""
-        return CameraIntrinsics(
-            self.fx * factor_x, self.fy * factor_y, self.cx * factor_x, self.cy * factor_y
-        )
+        return CameraIntrinsics(self.fx * factor_x, self.fy * factor_y, self.cx * factor_x, self.cy * factor_y)
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +161,7 @@ class RoiMask:
         rows, columns = -(-height // block_size), -(-width // block_size)
         padded = np.zeros((rows * block_size, columns * block_size), np.bool_)
         padded[:height, :width] = mask
-        blocks = padded.reshape(rows, block_size, columns, block_size).any(axis=(1, 3))
+        blocks = np.asarray(padded.reshape(rows, block_size, columns, block_size).any(axis=(1, 3)), np.bool_)
         return cls(blocks, block_size, height, width)
 
     def pixels(self) -> BoolMask:
@@ -171,7 +169,8 @@ class RoiMask:
         if self.block_size == 1:
             return self.blocks
         grown = self.blocks.repeat(self.block_size, axis=0).repeat(self.block_size, axis=1)
-        return grown[: self.height, : self.width]
+        pixels: BoolMask = grown[: self.height, : self.width]
+        return pixels
 
     @property
     def coverage(self) -> float:

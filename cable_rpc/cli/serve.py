@@ -1,0 +1,73 @@
+"""`cable-rpc serve`: the cloud."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+from typing import Annotated
+
+import typer
+
+from cable_rpc.errors import ConfigurationError
+
+
+def serve(
+    listen: Annotated[
+        str, typer.Option(help="HOST:PORT to listen on; port 0 picks a free one.", metavar="HOST:PORT")
+    ] = "127.0.0.1:50051",
+    detector: Annotated[
+        str,
+        typer.Option(help="embedded | onnx:FILE (RT-DETR export with labels/boxes/scores or logits/pred_boxes)."),
+    ] = "embedded",
+    segmenter: Annotated[
+        str,
+        typer.Option(help="boxes (the detector's boxes, filled) | oracle:SOURCE (ground truth, evaluation only)."),
+    ] = "boxes",
+    device: Annotated[str, typer.Option(help="auto | cpu | cuda.")] = "auto",
+    threads: Annotated[int, typer.Option(help="CPU threads of each model.", min=1)] = 1,
+    min_score: Annotated[float, typer.Option(help="Detections below are dropped.", min=0.0, max=1.0)] = 0.4,
+    max_in_flight: Annotated[int, typer.Option(help="Unanswered frames granted to a client.", min=1)] = 2,
+    max_frame_bytes: Annotated[int, typer.Option(help="Largest coded frame accepted.", min=1024)] = 2 << 20,
+    insecure: Annotated[
+        bool,
+        typer.Option(
+            "--insecure", help="Allow a non-loopback address without TLS. Only on a network you trust end to end."
+        ),
+    ] = False,
+) -> None:
+    """Host the models and answer cameras over gRPC.
+
+    Example: [bold]cable-rpc serve --listen 0.0.0.0:50051 --insecure --detector onnx:rtdetr_r50vd.onnx[/bold]
+    """
+    if not (insecure or is_loopback(listen)):
+        raise ConfigurationError(
+            f"--listen {listen} is reachable from other machines and this server speaks plain text; "
+            "add --insecure if the network is trusted (a VPN or a lab), or listen on 127.0.0.1"
+        )
+    from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segmenter
+    from cable_rpc.cloud.model_runner import ThreadModelRunner
+    from cable_rpc.cloud.perception import PerceptionModels
+    from cable_rpc.cloud.service import ServerConfig, serve_until_signal
+    from cable_rpc.cloud.session import SessionLimits
+
+    options = BackendOptions(device=device, threads=threads, min_score=min_score)
+    models = PerceptionModels(
+        load_detector(detector, options),
+        load_segmenter(segmenter, options),
+        ThreadModelRunner("detector"),
+        ThreadModelRunner("segmenter"),
+    )
+    limits = SessionLimits(max_in_flight=max_in_flight, max_frame_bytes=max_frame_bytes, default_min_score=min_score)
+    config = ServerConfig(address=listen, limits=limits)
+    asyncio.run(serve_until_signal(models, config, announce=lambda line: print(line, flush=True)))
+
+
+def is_loopback(address: str) -> bool:
+    """True when HOST:PORT can only be reached from this machine."""
+    host = address.rpartition(":")[0].strip("[]")
+    if host == "localhost" or address.startswith("unix:"):
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

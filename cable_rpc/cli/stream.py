@@ -1,0 +1,135 @@
+"""`cable-rpc stream`: the edge."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cable_rpc.cli.progress import RunProgress
+from cable_rpc.data.source import FrameSource, open_source
+from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
+from cable_rpc.study.summary_table import render_summary
+from cable_rpc.types import CameraIntrinsics
+
+console = Console()
+
+
+def stream(
+    source: Annotated[
+        str, typer.Option(help="video:FILE, video:FOLDER of images, or synthetic:SEED.", metavar="SCHEME:...")
+    ],
+    target: Annotated[str, typer.Option(help="HOST:PORT of the server.", metavar="HOST:PORT")] = "127.0.0.1:50051",
+    codec: Annotated[str, typer.Option(help="h264 | jpeg | webp.")] = "h264",
+    quality: Annotated[
+        int | None, typer.Option(help="JPEG/WebP quality 1..100 (75), H.264 CRF 0..51 (28; lower is better).")
+    ] = None,
+    strategy: Annotated[str, typer.Option(help="cable (region of interest) | full-frame (baseline).")] = "cable",
+    pace: Annotated[
+        str,
+        typer.Option(
+            help="lockstep: every frame, one at a time, reproducible | realtime: as a camera delivers them, the newest "
+            "frame wins and late ones are dropped and counted."
+        ),
+    ] = "lockstep",
+    out: Annotated[Path, typer.Option(help="Folder for frames.csv, summary.json, annotated.mp4, report.html.")] = Path(
+        "out/stream"
+    ),
+    frames: Annotated[int | None, typer.Option(help="Stop after so many frames.", min=1)] = None,
+    fps: Annotated[float | None, typer.Option(help="Thin a video to this rate; rate of an image folder.")] = None,
+    size: Annotated[str | None, typer.Option(help="Resize to WIDTHxHEIGHT before anything else.")] = None,
+    ego_csv: Annotated[
+        Path | None, typer.Option(help="Ego-motion of a video: CSV with speed_mps and yaw_rate_radps (left positive).")
+    ] = None,
+    focal: Annotated[
+        float | None, typer.Option(help="Focal length of the video's camera in pixels, for the ego-motion warp.")
+    ] = None,
+    block_size: Annotated[int, typer.Option(help="Grid that the region is grown to; 1 = exact.", min=1)] = 8,
+    prompt: Annotated[str, typer.Option(help="Sentence for an open-vocabulary segmenter.")] = "",
+    min_score: Annotated[
+        float, typer.Option(help="Detections below are not sent; 0 = the server's setting.", min=0.0, max=1.0)
+    ] = 0.0,
+    client_id: Annotated[str, typer.Option(help="Name of this camera in the server's logs.")] = "",
+    evaluate: Annotated[
+        bool,
+        typer.Option(
+            help="Stream the same frames whole afterwards: byte saving, detection retention, annotated video."
+        ),
+    ] = True,
+) -> None:
+    """Stream a camera through the loop and measure what it costs.
+
+    Example: [bold]cable-rpc stream --source video:drive.mp4 --target gpu-box:50051 --codec h264[/bold]
+    """
+    if pace not in {"lockstep", "realtime"}:
+        raise ConfigurationError(f"--pace is '{pace}'; use lockstep or realtime")
+    if strategy not in {"cable", "full-frame"}:
+        raise ConfigurationError(f"--strategy is '{strategy}'; use cable or full-frame")
+    if codec not in {"h264", "jpeg", "webp"}:
+        raise ConfigurationError(f"--codec is '{codec}'; use h264, jpeg or webp")
+    frame_size = parse_size(size)
+    opened = open_source(
+        source,
+        max_frames=frames,
+        ego_csv=ego_csv,
+        size=frame_size,
+        intrinsics=centred_intrinsics(focal, source),
+        fps=fps,
+    )
+    config = StreamRunConfig(
+        target=target,
+        out=out,
+        codec=codec,
+        quality=quality,
+        strategy=strategy,
+        realtime=pace == "realtime",
+        block_size=block_size,
+        prompt=prompt,
+        min_score=min_score,
+        client_id=client_id,
+        evaluate=evaluate,
+        command_line=shlex.join(["cable-rpc", *sys.argv[1:]]),
+    )
+    run_and_report(opened, config)
+
+
+def run_and_report(source: FrameSource, config: StreamRunConfig) -> None:
+    """Runs with live progress, prints the closing table, writes the report where its extra is installed."""
+    with RunProgress(console, source.frame_count, source.fps) as progress:
+        summary = asyncio.run(StreamRun(source, config, progress.update).run())
+    console.print(render_summary(summary))
+    if importlib.util.find_spec("plotly") is None or importlib.util.find_spec("jinja2") is None:
+        console.print(f"wrote {config.out}; install 'cable-rpc\\[study]' for the HTML report")
+        return
+    from cable_rpc.study.report import write_report
+
+    console.print(f"report: {write_report(config.out)}")
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """ "960x540" as (960, 540).
+
+    Raises:
+        ConfigurationError: if it is anything else.
+    """
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ConfigurationError(f"--size is '{text}'; write WIDTHxHEIGHT, e.g. 960x540")
+    return int(width), int(height)
+
+
+def centred_intrinsics(focal: float | None, source: str) -> CameraIntrinsics | None:
+    """A camera with its axis through the middle of the source's own picture."""
+    if focal is None:
+        return None
+    width, height = open_source(source).size_wh
+    return CameraIntrinsics(focal, focal, width / 2, height / 2)

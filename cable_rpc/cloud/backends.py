@@ -1,0 +1,90 @@
+"""What a detector and a segmenter must offer, and how back ends are found by name.
+
+A back end registers through an entry point of the group ``cable_rpc.detectors`` or ``cable_rpc.segmenters``: a
+callable ``(argument: str, options: BackendOptions) -> Detector | Segmenter``. ``--segmenter lisa:FOLDER`` calls the
+entry point ``lisa`` with ``"FOLDER"``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any, Protocol, cast
+
+from cable_rpc.errors import ConfigurationError
+from cable_rpc.types import BoolMask, Detections, Image, Segmentation
+
+
+@dataclass(frozen=True, slots=True)
+class BackendOptions:
+    """Settings that every back end is given."""
+
+    device: str = "auto"
+    """"auto", "cpu" or "cuda"."""
+    threads: int = 1
+    """CPU threads of one model."""
+    min_score: float = 0.4
+    """Detections below are dropped (the paper's threshold)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameContext:
+    """What is known of a frame besides its pixels."""
+
+    sequence: int
+    """The camera's frame number."""
+    detections: Detections
+    """The detector's boxes of the same picture."""
+
+
+class Detector(Protocol):
+    """Finds road users."""
+
+    name: str
+    revision: str
+    device: str
+
+    def detect(self, images: Sequence[Image]) -> list[Detections]:
+        """Boxes for each uint8 [H, W, 3] BGR image, best score first, in pixels of that image."""
+        ...
+
+
+class Segmenter(Protocol):
+    """Answers with a mask of road actors."""
+
+    name: str
+    revision: str
+    device: str
+
+    def segment(self, image: Image, roi: BoolMask, prompt: str, context: FrameContext) -> Segmentation:
+        """Mask for a uint8 [H, W, 3] BGR image whose pixels outside ``roi`` (bool [H, W]) are blank.
+
+        The caller intersects the mask with the region.
+        """
+        ...
+
+
+def _load(kind: str, spec: str, options: BackendOptions) -> Any:
+    name, _, argument = spec.partition(":")
+    known = {entry.name: entry for entry in entry_points(group=f"cable_rpc.{kind}s")}
+    if name not in known:
+        raise ConfigurationError(
+            f"no {kind} back end is called '{name}' (from '{spec}'); installed: {', '.join(sorted(known))}"
+        )
+    return known[name].load()(argument, options)
+
+
+def load_detector(spec: str, options: BackendOptions) -> Detector:
+    """Loads ``NAME`` or ``NAME:ARGUMENT``, e.g. ``onnx:model.onnx``.
+
+    Raises:
+        ConfigurationError: unknown name (lists the installed ones) or unusable argument.
+        ModelError: the model can't be loaded.
+    """
+    return cast(Detector, _load("detector", spec, options))
+
+
+def load_segmenter(spec: str, options: BackendOptions) -> Segmenter:
+    """Like `load_detector`, for segmenters, e.g. ``boxes``."""
+    return cast(Segmenter, _load("segmenter", spec, options))

@@ -1,0 +1,85 @@
+"""The models' part of a frame: boxes, then a mask inside the region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cable_rpc.cloud.backends import Detector, FrameContext, Segmenter
+from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
+from cable_rpc.types import BoolMask, Detections, Image, Segmentation
+
+DEFAULT_PROMPT = "Please segment all vehicles, pedestrians and cyclists on the road."
+
+
+@dataclass(frozen=True, slots=True)
+class StageRun:
+    """One model's share of a frame's time."""
+
+    stage: str
+    wait_ns: int
+    run_ns: int
+    batch_size: int
+
+    @classmethod
+    def of(cls, stage: str, run: ModelRun[Any]) -> StageRun:
+        """Names a model run."""
+        return cls(stage, run.wait_ns, run.run_ns, run.batch_size)
+
+
+@dataclass(frozen=True, slots=True)
+class Perception:
+    """What the models say of one frame."""
+
+    detections: Detections
+    segmentation: Segmentation
+    stages: tuple[StageRun, ...]
+
+
+class PerceptionModels:
+    """The detector and the segmenter that all sessions of a server share."""
+
+    def __init__(
+        self,
+        detector: Detector,
+        segmenter: Segmenter,
+        detector_runner: ModelRunner,
+        segmenter_runner: ModelRunner,
+    ) -> None:
+        self.detector = detector
+        self.segmenter = segmenter
+        self._detector_runner = detector_runner
+        self._segmenter_runner = segmenter_runner
+
+    async def perceive(
+        self, image: Image, roi: BoolMask | None, *, prompt: str, min_score: float, sequence: int
+    ) -> Perception:
+        """Runs both models on one picture.
+
+        Args:
+            image: uint8 [H, W, 3] BGR, blank outside the region.
+            roi: bool [H, W]; None = the whole frame.
+            prompt: sentence for the segmenter; empty = `DEFAULT_PROMPT`.
+            min_score: detections below are dropped.
+            sequence: the camera's frame number.
+        """
+        detected = await self._detector_runner.infer(lambda: self.detector.detect([image])[0])
+        detections = detected.value.select(detected.value.scores >= min_score)
+        context = FrameContext(sequence, detections)
+        segmented = await self._segmenter_runner.infer(
+            lambda: _inside(self.segmenter, image, roi, prompt or DEFAULT_PROMPT, context)
+        )
+        stages = (StageRun.of("detect", detected), StageRun.of("segment", segmented))
+        return Perception(detections, segmented.value, stages)
+
+
+def _inside(
+    segmenter: Segmenter, image: Image, roi: BoolMask | None, prompt: str, context: FrameContext
+) -> Segmentation:
+    """M_k = F(I~_k, p) intersected with R_k."""
+    if roi is None:
+        return segmenter.segment(image, np.ones(image.shape[:2], np.bool_), prompt, context)
+    segmentation = segmenter.segment(image, roi, prompt, context)
+    return replace(segmentation, mask=segmentation.mask & roi)

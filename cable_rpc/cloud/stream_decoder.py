@@ -1,0 +1,119 @@
+"""From a VideoFrame message to the picture that the models see: checks, decoding, re-masking. Runs off the loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cable_codecs import CodecError, CodecParameters, Decoder, create_decoder, fill_background
+
+from cable_rpc.errors import FrameError, ProtocolError
+from cable_rpc.types import BoolMask, Image
+from cable_rpc.wire.convert import codec_name, region_from_message
+from cable_rpc.wire.v1 import perception_pb2 as pb
+
+STILL_CODECS = frozenset({pb.CODEC_JPEG, pb.CODEC_WEBP})
+
+
+class FrameRejection(FrameError):
+    """This frame can't be processed; carries the machine-readable reason."""
+
+    def __init__(self, reason: pb.RejectReason, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedFrame:
+    """A decoded picture, blank outside its region."""
+
+    image: Image
+    """uint8 [H, W, 3] BGR."""
+    roi: BoolMask | None
+    """bool [H, W]; None = the whole frame."""
+
+
+class StreamDecoder:
+    """Decoder state of one session.
+
+    Raises:
+        ProtocolError: if the configuration is unusable (unknown codec, size zero or above the limit).
+    """
+
+    def __init__(self, config: pb.CodecConfig, max_pixels: int) -> None:
+        name = codec_name(config.codec)
+        if config.width == 0 or config.height == 0:
+            raise ProtocolError(f"CodecConfig asks for {config.width}x{config.height}; both sides must be positive")
+        if config.width * config.height > max_pixels:
+            raise ProtocolError(
+                f"CodecConfig asks for {config.width}x{config.height} = {config.width * config.height} pixels, "
+                f"this server accepts {max_pixels}; stream at a lower resolution"
+            )
+        self._height, self._width = config.height, config.width
+        self._is_video = config.codec not in STILL_CODECS
+        parameters = CodecParameters(name, config.width, config.height, config.frame_rate or 10.0)
+        try:
+            self._decoder: Decoder = create_decoder(parameters)
+        except CodecError as error:
+            raise ProtocolError(str(error)) from error
+        self._lost = False
+        self.last_good_sequence: int | None = None
+
+    @property
+    def needs_keyframe(self) -> bool:
+        """True when the next frame must be a keyframe."""
+        return self._is_video and (self._lost or self._decoder.needs_keyframe)
+
+    def mark_lost(self) -> None:
+        """A coded frame never reached the decoder; later frames that refer to it are refused."""
+        self._lost = True
+
+    def decode(self, frame: pb.VideoFrame) -> DecodedFrame:
+        """Decodes one frame and blanks everything outside its region.
+
+        Raises:
+            FrameRejection: with the reason that the client is told.
+        """
+        roi = self._region(frame)
+        self._check_reference(frame)
+        try:
+            image = self._decoder.decode(frame.data)
+        except CodecError as error:
+            self.mark_lost()
+            raise FrameRejection(
+                pb.REJECT_REASON_UNDECODABLE, f"frame {frame.sequence} can't be decoded: {error}"
+            ) from error
+        self._lost = False
+        self.last_good_sequence = frame.sequence
+        if roi is None:
+            return DecodedFrame(image, None)
+        return DecodedFrame(fill_background(image, roi, "zero"), roi)
+
+    def close(self) -> None:
+        """Frees the codec."""
+        self._decoder.close()
+
+    def _region(self, frame: pb.VideoFrame) -> BoolMask | None:
+        if not frame.HasField("region"):
+            return None
+        try:
+            return region_from_message(frame.region, self._height, self._width).pixels()
+        except ProtocolError as error:
+            self.mark_lost()
+            raise FrameRejection(pb.REJECT_REASON_INVALID_REGION, f"frame {frame.sequence}: {error}") from error
+
+    def _check_reference(self, frame: pb.VideoFrame) -> None:
+        if not self._is_video or frame.keyframe:
+            return
+        if self.needs_keyframe:
+            raise FrameRejection(
+                pb.REJECT_REASON_UNDECODABLE,
+                f"frame {frame.sequence} is not a keyframe, and the decoder needs one; force an IDR",
+            )
+        if not frame.HasField("reference_sequence") or frame.reference_sequence != self.last_good_sequence:
+            shown = frame.reference_sequence if frame.HasField("reference_sequence") else "nothing"
+            self.mark_lost()
+            raise FrameRejection(
+                pb.REJECT_REASON_UNDECODABLE,
+                f"frame {frame.sequence} refers to {shown}, but the last frame decoded here is "
+                f"{self.last_good_sequence}; force an IDR",
+            )

@@ -1,0 +1,87 @@
+"""What the edge hears from the cloud, as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from cable_rpc.types import Detections, Segmentation
+from cable_rpc.wire.convert import detections_from_messages, mask_from_message
+from cable_rpc.wire.v1 import perception_pb2 as pb
+
+
+@dataclass(frozen=True, slots=True)
+class ServerTimes:
+    """Where a frame's time went at the server; stamps on the server's monotonic clock."""
+
+    receive_time_ns: int = 0
+    send_time_ns: int = 0
+    decode_ns: int = 0
+    queue_ns: int = 0
+    """All waiting for threads and models."""
+    run_ns: Mapping[str, int] = field(default_factory=dict)
+    """Model stages ("detect", "segment") to their durations."""
+
+    @classmethod
+    def from_message(cls, timing: pb.ServerTiming) -> ServerTimes:
+        """From the wire."""
+        return cls(
+            timing.receive_time_ns,
+            timing.send_time_ns,
+            timing.decode_ns,
+            timing.decode_wait_ns + sum(stage.wait_ns for stage in timing.stages),
+            {stage.stage: stage.run_ns for stage in timing.stages},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAnswer:
+    """The cloud's answer to one frame."""
+
+    sequence: int
+    receive_time_ns: int
+    """When it reached the edge, on the edge's monotonic clock."""
+    message_bytes: int
+    """Size of the whole serialised response."""
+    times: ServerTimes
+    detections: Detections
+    segmentation: Segmentation | None
+    mask_data: bytes
+    """The mask as coded on the wire."""
+    rejection: str | None = None
+    """Why the frame was not processed; None = it was."""
+
+    @classmethod
+    def from_result(
+        cls, result: pb.Result, height: int, width: int, *, receive_time_ns: int, message_bytes: int
+    ) -> FrameAnswer:
+        """From the wire.
+
+        Raises:
+            ProtocolError: if the mask does not belong to a frame of this size.
+        """
+        has_mask = result.HasField("mask")
+        return cls(
+            result.sequence,
+            receive_time_ns,
+            message_bytes,
+            ServerTimes.from_message(result.timing),
+            detections_from_messages(result.detections),
+            mask_from_message(result.mask, height, width) if has_mask else None,
+            result.mask.data if has_mask else b"",
+        )
+
+    @classmethod
+    def from_rejection(cls, rejected: pb.FrameRejected, *, receive_time_ns: int, message_bytes: int) -> FrameAnswer:
+        """From the wire."""
+        reason = pb.RejectReason.Name(rejected.reason).removeprefix("REJECT_REASON_")
+        return cls(
+            rejected.sequence,
+            receive_time_ns,
+            message_bytes,
+            ServerTimes.from_message(rejected.timing),
+            Detections.empty(),
+            None,
+            b"",
+            f"{reason}: {rejected.message}",
+        )
