@@ -1,0 +1,62 @@
+"""Fills against plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cable_codecs import CodecError, fill_background
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+
+def literal_fill(image, roi, mode):
+    filled = image.copy()
+    outside = image[~roi].astype(np.float64)
+    mean = outside.mean(axis=0) if len(outside) else np.zeros(3)
+    filled[~roi] = {"zero": 0, "grey": 128, "mean": np.rint(mean)}[mode]
+    return filled
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    height=st.integers(1, 30),
+    width=st.integers(1, 30),
+    density=st.sampled_from([0.0, 0.3, 1.0]),
+    mode=st.sampled_from(["zero", "grey", "mean"]),
+)
+def test_fill(seed, height, width, density, mode):
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (height, width, 3), np.uint8)
+    roi = rng.random((height, width)) < density
+    before = image.copy()
+    filled = fill_background(image, roi, mode)
+    assert np.array_equal(filled, literal_fill(image, roi, mode))
+    assert np.array_equal(image, before)
+    out = np.full_like(image, 77)
+    assert fill_background(image, roi, mode, out=out) is out
+    assert np.array_equal(out, filled)
+
+
+@pytest.mark.parametrize("mode", ["zero", "grey", "mean"])
+def test_views_with_strides(mode):
+    rng = np.random.default_rng(0)
+    image, roi = rng.integers(0, 256, (20, 30, 3), np.uint8), rng.random((20, 30)) < 0.5
+    filled = fill_background(image[::2, ::-1], roi[::2, ::-1], mode)
+    assert np.array_equal(filled, literal_fill(image[::2, ::-1], roi[::2, ::-1], mode))
+
+
+def test_wrong_arguments_are_named():
+    image, roi = np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), bool)
+    with pytest.raises(CodecError, match="zero, grey, mean"):
+        fill_background(image, roi, "pink")
+    with pytest.raises(CodecError, match="image"):
+        fill_background(image[..., 0], roi, "zero")
+    with pytest.raises(CodecError, match="region"):
+        fill_background(image, roi[:2], "zero")
+    with pytest.raises(CodecError, match="region"):
+        fill_background(image, roi.astype(np.uint8), "zero")
+    with pytest.raises(CodecError, match="contiguous"):
+        fill_background(image, roi, "zero", out=np.zeros((4, 12, 3), np.uint8)[:, ::2])
+    with pytest.raises(CodecError, match="memory"):
+        fill_background(image, roi, "grey", out=image)
