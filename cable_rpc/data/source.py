@@ -1,0 +1,140 @@
+"""Frame sources by name: ``SCHEME:REST`` to an iterable of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from cable_rpc.errors import ConfigurationError
+from cable_rpc.types import CameraIntrinsics, Frame
+
+
+class FrameSource(Protocol):
+    """A recording or camera. Each iteration starts from the beginning where the medium allows it."""
+
+    @property
+    def name(self) -> str:
+        """Short name for logs, tables and file names."""
+        ...
+
+    @property
+    def fps(self) -> float:
+        """Nominal frame rate; true times are in the frames."""
+        ...
+
+    @property
+    def size_wh(self) -> tuple[int, int]:
+        """(width, height) of the frames in pixels."""
+        ...
+
+    @property
+    def frame_count(self) -> int | None:
+        """Number of frames, None where it can't be known beforehand."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames with index 0, 1, 2, ... and rising capture times."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SourceOptions:
+    """What a user may ask of any source; None leaves it to the source."""
+
+    max_frames: int | None = None
+    ego_csv: Path | None = None
+    size: tuple[int, int] | None = None
+    intrinsics: CameraIntrinsics | None = None
+    fps: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ConfigurationError(f"max_frames is {self.max_frames}; give at least 1")
+        if self.size is not None and min(self.size) < 1:
+            raise ConfigurationError(f"size is {self.size[0]}x{self.size[1]}; give at least 1x1 pixels")
+        if self.fps is not None and not 0 < self.fps < 1e6:
+            raise ConfigurationError(f"fps is {self.fps}; give a positive frame rate")
+
+
+SourceFactory = Callable[[str, SourceOptions], FrameSource]
+
+
+def open_video(rest: str, options: SourceOptions) -> FrameSource:
+    """``video:FILE``, or ``video:FOLDER`` for a folder of numbered images."""
+    from cable_rpc.data.ego_csv import read_ego_csv
+    from cable_rpc.data.image_folder import ImageFolderSource
+    from cable_rpc.data.video import VideoSource
+
+    path = Path(rest)
+    ego = None if options.ego_csv is None else read_ego_csv(options.ego_csv)
+    kind = ImageFolderSource if path.is_dir() else VideoSource
+    return kind(
+        path,
+        max_frames=options.max_frames,
+        ego=ego,
+        size=options.size,
+        intrinsics=options.intrinsics,
+        fps=options.fps,
+    )
+
+
+def open_synthetic(rest: str, options: SourceOptions) -> FrameSource:
+    """``synthetic:SEED``; ego-motion and intrinsics are the simulation's own."""
+    from cable_rpc.data.synthetic import SyntheticConfig, SyntheticSource
+
+    if options.ego_csv is not None or options.intrinsics is not None:
+        raise ConfigurationError(
+            "a synthetic source simulates its own ego-motion and camera; leave ego_csv and intrinsics out"
+        )
+    try:
+        seed = int(rest)
+    except ValueError:
+        raise ConfigurationError(f"'synthetic:{rest}': the seed must be a whole number") from None
+    if seed < 0:
+        raise ConfigurationError(f"'synthetic:{rest}': the seed must be at least 0")
+    settings: dict[str, Any] = {"seed": seed}
+    if options.size is not None:
+        settings["width"], settings["height"] = options.size
+    if options.fps is not None:
+        settings["fps"] = options.fps
+    if options.max_frames is not None:
+        settings["frame_count"] = options.max_frames
+    return SyntheticSource(SyntheticConfig(**settings))
+
+
+SOURCES: Mapping[str, SourceFactory] = {"video": open_video, "synthetic": open_synthetic}
+"""Scheme to factory."""
+
+
+def open_source(
+    spec: str,
+    *,
+    max_frames: int | None = None,
+    ego_csv: Path | None = None,
+    size: tuple[int, int] | None = None,
+    intrinsics: CameraIntrinsics | None = None,
+    fps: float | None = None,
+) -> FrameSource:
+    """Open a frame source.
+
+    Args:
+        spec: ``video:FILE``, ``video:FOLDER`` of images, or ``synthetic:SEED``.
+        max_frames: stop after that many frames.
+        ego_csv: ego-motion log for a video (``cable_rpc.data.ego_csv``).
+        size: (width, height) to resize to; intrinsics are scaled along.
+        intrinsics: the camera, in pixels of the video's own size.
+        fps: frame rate; a video of a higher rate is thinned, a folder of images is played at it.
+
+    Raises:
+        ConfigurationError: unknown scheme or unusable option.
+        SourceError: the source can't be read.
+    """
+    scheme, separator, rest = spec.partition(":")
+    factory = SOURCES.get(scheme)
+    if factory is None or not separator or not rest:
+        known = ", ".join(f"{name}:..." for name in sorted(SOURCES))
+        hint = f"; for a file write 'video:{spec}'" if Path(spec).exists() else ""
+        raise ConfigurationError(f"can't open source '{spec}': known are {known}{hint}")
+    return factory(rest, SourceOptions(max_frames, ego_csv, size, intrinsics, fps))

@@ -1,0 +1,99 @@
+"""The edge's loop: capture, prepare, send, and apply what comes back, each in its own task."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncGenerator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+from cable_rpc.edge.capture import Capture
+from cable_rpc.edge.client import PerceptionClient
+from cable_rpc.edge.frame_encoder import FrameEncoder, PreparedFrame
+from cable_rpc.errors import RemoteError
+from cable_rpc.wire.answers import FrameAnswer
+
+
+@dataclass(frozen=True, slots=True)
+class StreamedFrame:
+    """A frame that went the whole way."""
+
+    prepared: PreparedFrame
+    answer: FrameAnswer
+    apply_ns: int
+    """Applying the mask to the tracker."""
+    applied_time_ns: int
+    """When the mask had become the prior, monotonic clock."""
+
+
+class EdgeStreamer:
+    """Streams one capture through one session.
+
+    The client's credit bounds what is in flight. A frame is taken from the camera only when there is a place for
+    it, so in real time it is always the newest, and frames are dropped before the encoder, never after.
+    """
+
+    def __init__(self, capture: Capture, encoder: FrameEncoder, client: PerceptionClient) -> None:
+        self._capture = capture
+        self._encoder = encoder
+        self._client = client
+        self._sent: dict[int, PreparedFrame] = {}
+        # One worker for tracker and encoder: both hold state and must see frames and masks in one order.
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="edge")
+
+    @property
+    def unanswered(self) -> list[int]:
+        """Indices of frames that were sent and not answered; what is left of them after an error is lost."""
+        return sorted(self._sent)
+
+    async def run(self) -> AsyncGenerator[StreamedFrame, None]:
+        """Yields every answered or rejected frame, in order, until the source ends.
+
+        Raises:
+            SourceError: the source failed.
+            RemoteError: the server closed the session or vanished.
+        """
+        self._capture.start()
+        sender = asyncio.create_task(self._send_all())
+        try:
+            async for answer in self._client.answers():
+                yield await self._apply(answer)
+                self._client.release_credit()
+            if not sender.done():
+                raise RemoteError(f"{self._client.target} ended the stream before the source did")
+            await sender
+        finally:
+            self._capture.stop()
+            sender.cancel()
+            await asyncio.gather(sender, return_exceptions=True)
+            self._worker.shutdown(wait=True)
+
+    async def _send_all(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                await self._client.acquire_credit()
+                captured = await self._capture.next_frame()
+                if captured is None:
+                    break
+                force_keyframe, self._client.keyframe_requested = self._client.keyframe_requested, False
+                prepare = partial(self._encoder.prepare, captured, force_keyframe=force_keyframe)
+                prepared = await loop.run_in_executor(self._worker, prepare)
+                self._sent[prepared.index] = prepared
+                await self._client.send(prepared.message)
+        finally:
+            await self._client.finish()
+
+    async def _apply(self, answer: FrameAnswer) -> StreamedFrame:
+        prepared = self._sent.pop(answer.sequence, None)
+        if prepared is None:
+            raise RemoteError(f"{self._client.target} answered frame {answer.sequence}, which is not open")
+        started_ns = time.monotonic_ns()
+        if answer.segmentation is not None:
+            await asyncio.get_running_loop().run_in_executor(
+                self._worker, self._encoder.strategy.update, answer.sequence, answer.segmentation.mask
+            )
+        applied_ns = time.monotonic_ns()
+        return StreamedFrame(prepared, answer, applied_ns - started_ns, applied_ns)
