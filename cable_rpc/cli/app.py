@@ -51,13 +51,10 @@ def root(
 
 
 def main() -> None:
-    """Entry point; errors raised on purpose become one line and exit code 2, Ctrl-C becomes 130."""
+    """Entry point; errors raised on purpose become one line and exit code 2 (Typer makes Ctrl-C 130)."""
     os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     try:
         app()
     except (CableError, CodecError) as error:
         print(f"cable-rpc: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("cable-rpc: interrupted", file=sys.stderr)
-        sys.exit(130)

@@ -51,11 +51,10 @@ def serve(
     from cable_rpc.cloud.session import SessionLimits
 
     options = BackendOptions(device=device, threads=threads, min_score=min_score)
+    hosted_segmenter = load_segmenter(segmenter, options)
+    hosted_detector = load_detector(detector, options)
     models = PerceptionModels(
-        load_detector(detector, options),
-        load_segmenter(segmenter, options),
-        ThreadModelRunner("detector"),
-        ThreadModelRunner("segmenter"),
+        hosted_detector, hosted_segmenter, ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
     )
     limits = SessionLimits(max_in_flight=max_in_flight, max_frame_bytes=max_frame_bytes, default_min_score=min_score)
     config = ServerConfig(address=listen, limits=limits)

@@ -56,6 +56,7 @@ def stream(
     min_score: Annotated[
         float, typer.Option(help="Detections below are not sent; 0 = the server's setting.", min=0.0, max=1.0)
     ] = 0.0,
+    connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the server.", min=0.1)] = 10.0,
     client_id: Annotated[str, typer.Option(help="Name of this camera in the server's logs.")] = "",
     evaluate: Annotated[
         bool,
@@ -94,6 +95,7 @@ def stream(
         prompt=prompt,
         min_score=min_score,
         client_id=client_id,
+        connect_timeout_s=connect_timeout,
         evaluate=evaluate,
         command_line=shlex.join(["cable-rpc", *sys.argv[1:]]),
     )
@@ -102,8 +104,15 @@ def stream(
 
 def run_and_report(source: FrameSource, config: StreamRunConfig) -> None:
     """Runs with live progress, prints the closing table, writes the report where its extra is installed."""
-    with RunProgress(console, source.frame_count, source.fps) as progress:
-        summary = asyncio.run(StreamRun(source, config, progress.update).run())
+    try:
+        with RunProgress(console, source.frame_count, source.fps) as progress:
+            summary = asyncio.run(StreamRun(source, config, progress.update).run())
+    except KeyboardInterrupt:
+        print(
+            f"cable-rpc: interrupted; frames.csv and summary.json in {config.out} hold what came so far",
+            file=sys.stderr,
+        )
+        raise
     console.print(render_summary(summary))
     if importlib.util.find_spec("plotly") is None or importlib.util.find_spec("jinja2") is None:
         console.print(f"wrote {config.out}; install 'cable-rpc\\[study]' for the HTML report")

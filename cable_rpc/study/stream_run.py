@@ -1,0 +1,230 @@
+"""One measured run: stream a source through the loop, then judge it against the same frames sent whole."""
+
+from __future__ import annotations
+
+import asyncio
+import platform
+import shutil
+from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
+from contextlib import aclosing
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from cable_codecs import CodecParameters
+
+import cable_rpc
+from cable_rpc.data.source import FrameSource
+from cable_rpc.edge.capture import Capture
+from cable_rpc.edge.client import PerceptionClient, SessionRequest
+from cable_rpc.edge.frame_encoder import FrameEncoder
+from cable_rpc.edge.roi_config import RoiConfig
+from cable_rpc.edge.roi_tracker import RoiTracker
+from cable_rpc.edge.strategy import FullFrame, RoiStrategy
+from cable_rpc.edge.streamer import EdgeStreamer, StreamedFrame
+from cable_rpc.study.evaluation import FrameEvidence, RunEvaluator, UplinkSpool, record_of
+from cable_rpc.study.run_record import (
+    FRAMES_FILE,
+    STILLS_FOLDER,
+    FrameCsvWriter,
+    FrameRecord,
+    RunInfo,
+    write_frames,
+)
+from cable_rpc.study.summary import RunSummary, summarise, write_summary
+from cable_rpc.types import CameraIntrinsics, Frame
+
+RecordListener = Callable[[str, FrameRecord], None]
+"""Is told ("stream" | "evaluate", record) after each frame of each pass."""
+
+VERSIONED_PACKAGES = ("cable-rpc", "av", "grpcio", "numpy", "opencv-python-headless", "protobuf")
+
+
+@dataclass(frozen=True, slots=True)
+class StreamRunConfig:
+    """How to run."""
+
+    target: str
+    out: Path
+    codec: str = "h264"
+    quality: int | None = None
+    """JPEG/WebP 1..100, H.264 CRF; None = the codec's default."""
+    strategy: str = "cable"
+    """"cable" or "full-frame"."""
+    realtime: bool = False
+    """True: frames come at their own pace and are dropped when the loop is late. False: lock-step, one at a time."""
+    block_size: int = 8
+    prompt: str = ""
+    min_score: float = 0.0
+    client_id: str = ""
+    connect_timeout_s: float = 10.0
+    evaluate: bool = True
+    """Second pass: the same frames whole, for their bytes and detections; quality; annotated video."""
+    roi: RoiConfig = field(default_factory=RoiConfig)
+    command_line: str = ""
+    notes: tuple[str, ...] = ()
+
+
+class StreamRun:
+    """Runs one source once; `run` returns the summary and leaves all files in ``config.out``."""
+
+    def __init__(self, source: FrameSource, config: StreamRunConfig, listener: RecordListener) -> None:
+        self._source = source
+        self._config = config
+        self._listener = listener
+        width, height = source.size_wh
+        self._parameters = CodecParameters(config.codec, width, height, source.fps, config.quality)
+        self._evidence: list[FrameEvidence] = []
+        self._unsent: list[FrameRecord] = []
+        self._info = RunInfo(
+            source=source.name,
+            width=width,
+            height=height,
+            fps=source.fps,
+            codec=config.codec,
+            quality=self._quality_text(),
+            strategy=config.strategy,
+            mode=config.roi.mode,
+            prompt=config.prompt,
+            pace="real time" if config.realtime else "lock-step",
+            server_target=config.target,
+            started=datetime.now(UTC).isoformat(timespec="seconds"),
+            command_line=config.command_line,
+            versions=_versions(),
+            notes=config.notes,
+        )
+
+    async def run(self) -> RunSummary:
+        """Streams, evaluates, writes.
+
+        A run that is interrupted or loses its server keeps what it had: frames.csv and summary.json are whole
+        either way, and the error is raised after they are written.
+
+        Raises:
+            RemoteError, SourceError, CodecError: what ended the run early.
+        """
+        out = self._config.out
+        out.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(out / STILLS_FOLDER, ignore_errors=True)
+        with UplinkSpool() as spool:
+            try:
+                await self._stream(spool)
+                if self._config.evaluate and self._evidence:
+                    await self._evaluate(spool)
+            finally:
+                summary = self._write()
+        return summary
+
+    async def _stream(self, spool: UplinkSpool) -> None:
+        config = self._config
+        strategy: RoiStrategy = (
+            FullFrame(config.block_size)
+            if config.strategy == "full-frame"
+            else RoiTracker(config.roi, config.block_size)
+        )
+        capture = Capture(self._source, realtime=config.realtime)
+        with FrameCsvWriter(config.out / FRAMES_FILE) as csv:
+            async with self._session(realtime=config.realtime) as client:
+                self._describe(client)
+                streamer = EdgeStreamer(capture, FrameEncoder(strategy, self._parameters), client)
+                try:
+                    async with aclosing(streamer.run()) as streamed_frames:
+                        async for streamed in streamed_frames:
+                            evidence = record_of(streamed, client.clock_offset)
+                            spool.append(streamed.prepared.encoded.data)
+                            self._evidence.append(evidence)
+                            csv.write(evidence.record)
+                            self._listener("stream", evidence.record)
+                finally:
+                    self._describe(client)
+                    self._unsent = [
+                        *(FrameRecord(index, 0, "dropped") for index in capture.dropped),
+                        *(FrameRecord(index, 0, "lost") for index in streamer.unanswered),
+                    ]
+
+    async def _evaluate(self, spool: UplinkSpool) -> None:
+        evaluator = RunEvaluator(self._parameters, self._source.fps, self._config.out, spool, len(self._evidence))
+        with evaluator:
+            async with aclosing(self._whole_frames()) as whole_frames:
+                position = 0
+                async for whole in whole_frames:
+                    evidence = await asyncio.to_thread(evaluator.judge, self._evidence[position], whole)
+                    self._evidence[position] = evidence
+                    position += 1
+                    self._listener("evaluate", evidence.record)
+
+    async def _whole_frames(self) -> AsyncGenerator[StreamedFrame, None]:
+        """The same frames once more, whole, in lock-step: the baseline that savings are measured against."""
+        indices = {evidence.record.index for evidence in self._evidence}
+        capture = Capture(_only(self._source, indices), realtime=False)
+        async with self._session(realtime=False) as client:
+            encoder = FrameEncoder(FullFrame(self._config.block_size), self._parameters)
+            streamer = EdgeStreamer(capture, encoder, client)
+            async with aclosing(streamer.run()) as streamed_frames:
+                async for streamed in streamed_frames:
+                    yield streamed
+
+    def _session(self, *, realtime: bool) -> PerceptionClient:
+        config, parameters = self._config, self._parameters
+        request = SessionRequest(
+            codec=config.codec,
+            width=parameters.width,
+            height=parameters.height,
+            frame_rate=parameters.frame_rate,
+            quality=config.quality or 0,
+            client_id=config.client_id or platform.node(),
+            prompt=config.prompt,
+            min_score=config.min_score,
+            intrinsics=_intrinsics(self._source),
+        )
+        window = None if realtime else 1
+        return PerceptionClient(config.target, request, window=window, connect_timeout_s=config.connect_timeout_s)
+
+    def _describe(self, client: PerceptionClient) -> None:
+        offset = client.clock_offset
+        models = [model.name for model in client.server_info.models]
+        self._info = replace(
+            self._info,
+            detector=models[0] if models else "",
+            segmenter=models[1] if len(models) > 1 else "",
+            server_version=client.server_info.server_version,
+            clock_offset_ns=offset.offset_ns if offset else None,
+            clock_offset_error_ns=offset.error_ns if offset else None,
+        )
+
+    def _write(self) -> RunSummary:
+        records = [evidence.record for evidence in self._evidence] + self._unsent
+        records.sort(key=lambda record: record.index)
+        write_frames(self._config.out / FRAMES_FILE, records)
+        summary = summarise(records, self._info)
+        write_summary(self._config.out, summary)
+        return summary
+
+    def _quality_text(self) -> str:
+        defaults = {"h264": 28, "jpeg": 75, "webp": 75}
+        quality = self._config.quality if self._config.quality is not None else defaults[self._config.codec]
+        return f"CRF {quality}" if self._config.codec == "h264" else f"quality {quality}"
+
+
+def _only(source: Iterable[Frame], indices: set[int]) -> Iterator[Frame]:
+    last = max(indices)
+    for frame in source:
+        if frame.index in indices:
+            yield frame
+        if frame.index >= last:
+            return
+
+
+def _intrinsics(source: FrameSource) -> CameraIntrinsics | None:
+    return getattr(source, "intrinsics", None)
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in VERSIONED_PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = cable_rpc.__version__ if package == "cable-rpc" else "?"
+    return found
