@@ -266,8 +266,8 @@ class RoiTracker:
         return Region(
             warped_prior=warped_prior,
             pixels=pixels,
-            coverage=np.count_nonzero(pixels) / pixels.size,
-            raw_coverage=np.count_nonzero(raw) / raw.size,
+            coverage=float(np.count_nonzero(pixels) / pixels.size),
+            raw_coverage=float(np.count_nonzero(raw) / raw.size),
             dilation_px=radius_px,
         )
 

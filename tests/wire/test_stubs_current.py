@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from importlib.resources import files
+from itertools import pairwise
 from pathlib import Path
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
@@ -64,8 +65,6 @@ def test_every_field_and_enum_value_is_documented(repository: Path) -> None:
     lines = (repository / "proto" / "cable" / "v1" / "perception.proto").read_text().splitlines()
     declared = re.compile(r"^\s+(optional |repeated )?[\w.]+ \w+ = \d+;|^\s+[A-Z0-9_]+ = \d+;|^(message|enum|service) ")
     undocumented = [
-        line.strip()
-        for before, line in zip(lines, lines[1:], strict=False)
-        if declared.match(line) and not before.strip().startswith("//")
+        line.strip() for before, line in pairwise(lines) if declared.match(line) and not before.strip().startswith("//")
     ]
     assert not undocumented
