@@ -28,6 +28,8 @@ from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
 CLOCK_SAMPLES_AT_START = 8
 CLOCK_INTERVAL_S = 5.0
+SILENCE_TIMEOUT_S = 10.0
+"""Rule R7 of the contract: the server says something every 5 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +76,19 @@ class PerceptionClient:
     """
 
     def __init__(
-        self, target: str, request: SessionRequest, *, window: int | None = None, connect_timeout_s: float = 10.0
+        self,
+        target: str,
+        request: SessionRequest,
+        *,
+        window: int | None = None,
+        connect_timeout_s: float = 10.0,
+        silence_timeout_s: float = SILENCE_TIMEOUT_S,
     ) -> None:
         self.target = target
         self._request = request
         self._window = window
         self._connect_timeout_s = connect_timeout_s
+        self._silence_timeout_s = silence_timeout_s
         self._stack = AsyncExitStack()
         self._clock = ClockOffsetEstimator()
         self.server_info = pb.GetServerInfoResponse()
@@ -159,7 +168,7 @@ class PerceptionClient:
             ProtocolError: the server sent something that does not fit.
         """
         try:
-            while (response := await self._call.read()) is not grpc.aio.EOF:
+            while (response := await self._read()) is not grpc.aio.EOF:
                 answer = self._understand(response)
                 if answer is not None:
                     yield answer
@@ -201,6 +210,15 @@ class PerceptionClient:
         self.max_frame_bytes = welcome.flow.max_frame_bytes
         granted = max(1, welcome.flow.max_in_flight)
         self._credit = asyncio.Semaphore(min(granted, self._window or granted))
+
+    async def _read(self) -> Any:
+        try:
+            async with asyncio.timeout(self._silence_timeout_s):
+                return await self._call.read()
+        except TimeoutError:
+            raise RemoteError(
+                f"{self.target} was silent for {self._silence_timeout_s:g} s: the connection is lost"
+            ) from None
 
     async def _write(self, request: pb.StreamPerceptionRequest) -> None:
         try:

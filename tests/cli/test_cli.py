@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -117,22 +118,51 @@ def test_real_clip_through_two_processes(shared_clip: Path, shared_detector: Pat
     assert sum(record.detection_count or 0 for record in records) > 0
 
 
+@contextmanager
+def stream_under_way(target: str, clip: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
+    """A streaming process that has some frames behind it."""
+    command = [sys.executable, "-m", "cable_rpc", "stream", "--source", f"video:{clip}", "--target", target]
+    process = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    part = out / "frames.csv.part"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (part.exists() and part.read_text().count("\n") > 5):
+        time.sleep(0.05)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def check_whole_files(out: Path) -> None:
+    assert len(read_frames(out / "frames.csv")) >= 5
+    assert (out / "summary.json").exists()
+    assert not list(out.glob("*.part"))
+
+
 def test_interrupt_leaves_whole_files(shared_clip: Path, shared_detector: Path, tmp_path: Path) -> None:
-    with local_server(["--detector", f"onnx:{shared_detector}"]) as target:
-        command = [sys.executable, "-m", "cable_rpc", "stream", "--source", f"video:{shared_clip}"]
-        process = subprocess.Popen(
-            [*command, "--target", target, "--out", str(tmp_path)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        part = tmp_path / "frames.csv.part"
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline and not (part.exists() and part.read_text().count("\n") > 5):
-            time.sleep(0.05)
+    with (
+        local_server(["--detector", f"onnx:{shared_detector}"]) as target,
+        stream_under_way(target, shared_clip, tmp_path) as process,
+    ):
         process.send_signal(signal.SIGINT)
         _, stderr = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert re.search("interrupted", stderr)
-    assert "Traceback" not in stderr
-    assert len(read_frames(tmp_path / "frames.csv")) >= 5
-    assert (tmp_path / "summary.json").exists()
-    assert not list(tmp_path.glob("*.part"))
+        assert process.returncode == 130
+        assert "interrupted" in stderr
+        assert "Traceback" not in stderr
+    check_whole_files(tmp_path)
+
+
+def test_killed_server_leaves_whole_files(shared_clip: Path, shared_detector: Path, tmp_path: Path) -> None:
+    serve = [sys.executable, "-m", "cable_rpc", "serve", "--listen", "127.0.0.1:0"]
+    server = subprocess.Popen([*serve, "--detector", f"onnx:{shared_detector}"], stdout=subprocess.PIPE, text=True)
+    assert server.stdout is not None
+    target = server.stdout.readline().strip().removeprefix("listening on ")
+    with stream_under_way(target, shared_clip, tmp_path) as process:
+        server.kill()
+        server.communicate()
+        _, stderr = process.communicate(timeout=30)
+        assert process.returncode == 2
+        assert f"the connection to {target} broke" in stderr
+        assert "Traceback" not in stderr
+    check_whole_files(tmp_path)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from cable_codecs import CodecParameters, create_decoder
 
+from cable_rpc.cloud.session import SessionLimits
 from cable_rpc.edge.capture import Capture
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder
@@ -78,6 +79,13 @@ async def streamed(
         return [frame async for frame in EdgeStreamer(capture, encoder, client).run()], capture
 
 
+async def stream_through(client: PerceptionClient, source: MovingSquare) -> None:
+    async with client:
+        encoder = FrameEncoder(FullFrame(), CodecParameters("jpeg", *source.size_wh, FPS))
+        async for _ in EdgeStreamer(Capture(source, realtime=False), encoder, client).run():
+            pass
+
+
 @pytest.mark.parametrize("codec", ["jpeg", "webp", "h264"])
 @pytest.mark.parametrize("size_wh", [(160, 96), (641, 479), (1225, 370)])
 async def test_the_cloud_sees_exactly_what_the_edge_decodes(
@@ -130,6 +138,16 @@ async def test_nobody_there_is_said_at_once(unused_tcp_port: int) -> None:
     )
     with pytest.raises(RemoteError, match="is `cable-rpc serve` running"):
         await client.__aenter__()
+
+
+async def test_silent_server_counts_as_lost(running_server: Any) -> None:
+    """Heartbeats are off and the model takes longer than the client's patience."""
+    limits = SessionLimits(heartbeat_s=60.0, close_timeout_s=0.1)
+    async with running_server(detector=StallingDetector(), limits=limits) as target:
+        request = SessionRequest("jpeg", 160, 96, FPS)
+        client = PerceptionClient(target, request, window=1, silence_timeout_s=0.05)
+        with pytest.raises(RemoteError, match=r"silent for 0\.05 s"):
+            await stream_through(client, MovingSquare(3))
 
 
 async def test_refused_session_carries_the_servers_reason(running_server: Any) -> None:
