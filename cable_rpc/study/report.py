@@ -1,0 +1,214 @@
+"""One run as a single HTML file that needs no network."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.metrics import Scores
+from cable_rpc.study.run_record import (
+    FRAMES_FILE,
+    REPORT_FILE,
+    STILLS_FOLDER,
+    SUMMARY_FILE,
+    VIDEO_FILE,
+    RunInfo,
+    read_frames,
+    read_run_info,
+    write_text,
+)
+from cable_rpc.study.summary import RunSummary, honesty_notes, summarise
+
+LAYER_LABELS = {
+    "bitstream": "coded picture · mask",
+    "with_roi": "+ region",
+    "message": "whole message",
+    "transport": "transport",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A headline figure."""
+
+    label: str
+    value: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class StillPair:
+    """One frame as the camera saw it, annotated, and as the cloud received it."""
+
+    index: int
+    camera: str
+    received: str
+
+
+def write_report(run_dir: Path) -> Path:
+    """Write ``report.html`` from the run's frames.csv, summary.json and stills.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ConfigurationError: the folder holds no run, or the ``study`` extra is not installed.
+    """
+    try:
+        from jinja2 import Environment, PackageLoader, select_autoescape
+        from plotly.offline import get_plotlyjs
+
+        from cable_rpc.study.report_plots import plots_of
+    except ImportError as error:
+        raise ConfigurationError(f"the report needs {error.name}: pip install 'cable-rpc[study]'") from error
+    records = read_frames(run_dir / FRAMES_FILE)
+    info = read_run_info(run_dir / SUMMARY_FILE)
+    summary = summarise(records, info)
+    page = Environment(
+        loader=PackageLoader("cable_rpc.study", "."), autoescape=select_autoescape(default=True)
+    ).get_template("report.html.j2")
+    path = run_dir / REPORT_FILE
+    text = page.render(
+        title=f"{info.source} · {info.codec} {info.quality} · {info.strategy}",
+        info=info,
+        summary=summary,
+        tiles=tiles_of(summary),
+        layers=layer_rows(summary),
+        quality=quality_rows(summary),
+        notes=honesty_notes(summary),
+        environment=environment_rows(info),
+        plots=[
+            (plot, plot.figure.to_json(engine="json").replace("</", "<\\/")) for plot in plots_of(records, info.fps)
+        ],
+        stills=still_pairs(run_dir / STILLS_FOLDER),
+        video=VIDEO_FILE if (run_dir / VIDEO_FILE).exists() else None,
+        plotly_js=get_plotlyjs().replace("</script>", "<\\/script>"),
+    )
+    write_text(path, text)
+    return path
+
+
+def tiles_of(summary: RunSummary) -> list[Tile]:
+    """The figures that a reader asks for first."""
+    message, end_to_end, quality = summary.layer("message"), summary.stage("end_to_end"), summary.quality
+    tiles = [
+        Tile("bytes saved", percent(message.byte_saving), "against the same frames whole, same codec and setting"),
+        Tile("pixels not sent", percent(summary.pixel_saving), "a share of the picture, no measure of bytes"),
+        Tile(
+            "uplink",
+            f"{number(message.uplink_kbps)} kbit/s",
+            f"{number(message.uplink_bytes_per_frame)} bytes a frame at {summary.info.fps:g} fps",
+        ),
+    ]
+    if end_to_end is not None:
+        detail = f"p95 {end_to_end.p95_ms:.0f} ms, p99 {end_to_end.p99_ms:.0f} ms"
+        tiles.append(Tile("end to end", f"{end_to_end.p50_ms:.0f} ms", f"median; {detail}"))
+    stale = summary.staleness_mean_frames
+    if stale is not None:
+        tiles.append(Tile("age of the prior", f"{stale:.1f} frames", f"mean; largest {summary.staleness_max_frames}"))
+    tiles.append(
+        Tile("detections kept", percent(quality.retention), f"{percent(quality.spurious_rate)} of them are new")
+    )
+    if quality.recognition:
+        shares = dict(quality.recognition)
+        detail = f"of the objects with half their box sent; {percent(shares.get(0.05))} at 5 %"
+        tiles.append(Tile("recognised", percent(shares.get(0.5)), detail))
+    return tiles
+
+
+def layer_rows(summary: RunSummary) -> list[tuple[str, ...]]:
+    """Bytes per frame and kbit/s by layer."""
+    rows = []
+    for layer in summary.layers:
+        label = LAYER_LABELS.get(layer.layer, layer.layer)
+        if layer.layer == "transport":
+            label = f"{label} ({summary.info.transport_source})"
+        rows.append(
+            (
+                label,
+                number(layer.uplink_bytes_per_frame),
+                number(layer.uplink_kbps),
+                number(layer.downlink_bytes_per_frame),
+                number(layer.downlink_kbps),
+                number(layer.full_frame_bytes_per_frame),
+                percent(layer.byte_saving),
+            )
+        )
+    return rows
+
+
+def quality_rows(summary: RunSummary) -> list[tuple[str, str, str]]:
+    """Figure, value, meaning."""
+    quality = summary.quality
+    rows = [
+        ("region R_k", percent(summary.coverage_roi), "of the picture, keyframes included (the paper's coverage)"),
+        ("sent", percent(summary.coverage_tx), "of the picture, frames sent whole counted as whole"),
+        ("frames sent whole", percent(summary.keyframe_rate), "of the frames sent"),
+        ("detection retention", percent(quality.retention), "of full-frame detections, pooled"),
+        ("spurious", percent(quality.spurious_rate), "of ROI-only detections, absent on full frames"),
+    ]
+    if quality.roi_psnr_db is not None:
+        rows.append(("PSNR in the region", f"{quality.roi_psnr_db:.1f} dB", "luma, decoded against camera"))
+    if quality.truth_count:
+        rows += [
+            (f"recognition at {100 * level:.0f} %", percent(value), "of visible objects, by share of the box sent")
+            for level, value in quality.recognition
+        ]
+    rows += score_rows(quality.micro, "pooled over the run, IoU 0.5")
+    rows += score_rows(quality.macro_frame, "mean over frames (the paper's way)")
+    return rows
+
+
+def score_rows(scores: Scores | None, meaning: str) -> list[tuple[str, str, str]]:
+    """Recall, precision and F1 as one row."""
+    if scores is None:
+        return []
+    value = " / ".join(percent(part) for part in (scores.recall, scores.precision, scores.f1))
+    return [("recall / precision / F1", value, meaning)]
+
+
+def environment_rows(info: RunInfo) -> list[tuple[str, str]]:
+    """What was run, on what."""
+    offset = "not measured"
+    if info.clock_offset_ns is not None and info.clock_offset_error_ns is not None:
+        offset = f"{info.clock_offset_ns / 1e6:.3f} ms ± {info.clock_offset_error_ns / 1e6:.3f} ms"
+    rows = [
+        ("source", f"{info.source}, {info.width}x{info.height}, {info.fps:g} fps"),
+        ("codec", f"{info.codec}, {info.quality}"),
+        ("strategy", f"{info.strategy}, {info.mode} mode, {info.pace}"),
+        ("detector", info.detector),
+        ("segmenter", info.segmenter),
+        ("server", f"{info.server_target} ({info.server_version})"),
+        ("server clock against edge clock", offset),
+        ("started", info.started),
+        ("command", info.command_line),
+        ("versions", ", ".join(f"{name} {version}" for name, version in info.versions.items())),
+    ]
+    return [(name, value) for name, value in rows if value]
+
+
+def still_pairs(folder: Path) -> list[StillPair]:
+    """The stills that come in pairs, in order, embedded."""
+    pairs = []
+    for camera in sorted(folder.glob("*_camera.jpg")):
+        received = camera.with_name(camera.name.replace("_camera", "_received"))
+        if received.exists():
+            pairs.append(StillPair(int(camera.name.split("_")[0]), data_uri(camera), data_uri(received)))
+    return pairs
+
+
+def data_uri(path: Path) -> str:
+    """A JPEG file as a data URI."""
+    return "data:image/jpeg;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def percent(value: float | None) -> str:
+    """A share as a percentage."""
+    return "–" if value is None else f"{100 * value:.1f} %"
+
+
+def number(value: float | None) -> str:
+    """A rounded number with thin spaces between thousands."""
+    return "–" if value is None else f"{value:,.0f}".replace(",", "\u202f")
