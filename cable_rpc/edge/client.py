@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,7 +158,8 @@ class PerceptionClient:
     async def finish(self) -> None:
         """No more frames; the server answers what is pending and ends the stream."""
         await self._write(pb.StreamPerceptionRequest(goodbye=pb.Goodbye()))
-        await self._call.done_writing()
+        with suppress(asyncio.InvalidStateError):  # the server may have ended the call on Goodbye already
+            await self._call.done_writing()
 
     async def answers(self) -> AsyncIterator[FrameAnswer]:
         """One answer for each frame sent, in order; ends with the stream.

@@ -40,6 +40,7 @@ class EdgeStreamer:
         self._encoder = encoder
         self._client = client
         self._sent: dict[int, PreparedFrame] = {}
+        self._finished = False
         # One worker for tracker and encoder: both hold state and must see frames and masks in one order.
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="edge")
 
@@ -61,7 +62,7 @@ class EdgeStreamer:
             async for answer in self._client.answers():
                 yield await self._apply(answer)
                 self._client.release_credit()
-            if not sender.done():
+            if not self._finished:
                 raise RemoteError(f"{self._client.target} ended the stream before the source did")
             await sender
         finally:
@@ -84,6 +85,7 @@ class EdgeStreamer:
                 self._sent[prepared.index] = prepared
                 await self._client.send(prepared.message)
         finally:
+            self._finished = True
             await self._client.finish()
 
     async def _apply(self, answer: FrameAnswer) -> StreamedFrame:

@@ -109,7 +109,11 @@ def tiles_of(summary: RunSummary) -> list[Tile]:
     if stale is not None:
         tiles.append(Tile("age of the prior", f"{stale:.1f} frames", f"mean; largest {summary.staleness_max_frames}"))
     tiles.append(
-        Tile("detections kept", percent(quality.retention), f"{percent(quality.spurious_rate)} of them are new")
+        Tile(
+            "detections kept",
+            percent(quality.retention),
+            f"of full-frame ones; {percent(quality.spurious_rate)} spurious",
+        )
     )
     if quality.recognition:
         shares = dict(quality.recognition)
