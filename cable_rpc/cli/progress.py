@@ -25,8 +25,8 @@ class RunProgress:
         self._recent: deque[tuple[float, FrameRecord]] = deque(maxlen=WINDOW)
         self._tasks: dict[str, TaskID] = {}
         self._progress = Progress(
-            TextColumn("{task.description:<18}"),
-            BarColumn(bar_width=24),
+            TextColumn("{task.description:<17}"),
+            BarColumn(bar_width=12),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("{task.fields[figures]}"),
@@ -60,9 +60,9 @@ class RunProgress:
         kbps = sum(record.uplink_message_bytes for record in records) / count * 8 * self._fps / 1e3
         stale = [record.staleness_frames for record in records if record.staleness_frames is not None]
         latencies = [record.end_to_end_ns for record in records if record.end_to_end_ns is not None]
-        parts = [self._rate(), f"{kbps:6.0f} kbit/s", f"{100 * coverage:3.0f} % of pixels"]
+        parts = [self._rate(), f"{kbps:6.0f} kbit/s", f"{100 * coverage:3.0f} % px"]
         if stale:
-            parts.append(f"mask {sum(stale) / len(stale):.1f} frames old")
+            parts.append(f"mask {sum(stale) / len(stale):.1f} old")
         if latencies:
-            parts.append(f"{sum(latencies) / len(latencies) / 1e6:.0f} ms")
+            parts.append(f"{sum(latencies) / len(latencies) / 1e6:3.0f} ms")
         return "  ".join(parts)

@@ -25,7 +25,7 @@ class BoxSegmenter:
         mask = np.zeros((height, width), np.bool_)
         boxes = context.detections.boxes_xyxy
         x_min, y_min = np.floor(boxes[:, :2]).clip(0).astype(int).T
-        x_max, y_max = np.ceil(boxes[:, 2:]).astype(int).T
+        x_max, y_max = np.ceil(boxes[:, 2:]).clip(0).astype(int).T
         for left, top, right, bottom in zip(x_min, y_min, x_max, y_max, strict=True):
             mask[top:bottom, left:right] = True
         scores = context.detections.scores

@@ -1,0 +1,197 @@
+"""Buildings: textured upright walls, and pitched roofs for houses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cable_rpc.data.synthetic.camera import Camera
+from cable_rpc.data.synthetic.facades import TEXELS_PER_M, Texture
+from cable_rpc.data.synthetic.mesh import Mesh, MeshBuilder
+from cable_rpc.data.synthetic.raster import Target, Window, composite, draw_mesh, window_around
+from cable_rpc.data.synthetic.road import Pose
+from cable_rpc.data.synthetic.shadows import ShadowLayer
+
+FloatArray = npt.NDArray[np.float64]
+
+NEAREST_WALL_M = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wall:
+    """An upright rectangle from `start` to `stop` (world x, y), seen from outside with start on the left."""
+
+    start: FloatArray
+    stop: FloatArray
+    texture: Texture
+
+    @property
+    def normal(self) -> FloatArray:
+        """Outward unit normal in the ground plane."""
+        along = self.stop - self.start
+        return np.array([along[1], -along[0]]) / float(np.linalg.norm(along))
+
+
+def visible_span(camera_base: FloatArray, half_tangent: float) -> tuple[float, float]:
+    """The part u0..u1 of a base line [2, 3] (camera axes) inside the horizontal field of view."""
+    low, high = 0.0, 1.0
+    (x0, _, z0), (x1, _, z1) = camera_base
+    for value0, value1 in (
+        (z0 - NEAREST_WALL_M, z1 - NEAREST_WALL_M),
+        (half_tangent * z0 - x0, half_tangent * z1 - x1),
+        (half_tangent * z0 + x0, half_tangent * z1 + x1),
+    ):
+        if value0 < 0 and value1 < 0:
+            return 1.0, 0.0
+        if value0 < 0:
+            low = max(low, value0 / (value0 - value1))
+        elif value1 < 0:
+            high = min(high, value0 / (value0 - value1))
+    return low, high
+
+
+def draw_wall(target: Target, wall: Wall) -> None:
+    """Draw one wall, lit and hazed."""
+    camera, ego = target.camera, target.ego
+    if float(wall.normal @ (np.array([ego.x, ego.y]) - wall.start)) <= 0.05:
+        return
+    base = np.array([[*wall.start, 0.0], [*wall.stop, 0.0]])
+    camera_base = camera.to_camera(ego.to_local(base))
+    half = camera.width / (2.0 * camera.intrinsics.fx) * 1.15 + 0.03
+    low, high = visible_span(camera_base, half)
+    if high - low < 1e-4:
+        return
+    texture = wall.texture
+    left, right = wall.start + low * (wall.stop - wall.start), wall.start + high * (wall.stop - wall.start)
+    corners = np.array([[*left, texture.height_m], [*right, texture.height_m], [*right, 0.0], [*left, 0.0]])
+    camera_points = camera.to_camera(ego.to_local(corners))
+    pixels = camera.image_points(camera_points)
+    window = window_around(target, pixels, 1)
+    if window is None:
+        return
+    span_m = (high - low) * texture.width_m
+    across = span_m * TEXELS_PER_M / max(float(np.ptp(pixels[:, 0])), 0.5)
+    tallest = max(abs(float(pixels[3, 1] - pixels[0, 1])), abs(float(pixels[2, 1] - pixels[1, 1])), 0.5)
+    down = texture.height_m * TEXELS_PER_M / tallest
+    picture = texture.level(round(math.log2(max(across, 1.0))), round(math.log2(max(down, 1.0))))
+    height, width = picture.shape[:2]
+    source = np.array([[low * width, 0], [high * width, 0], [high * width, height], [low * width, height]])
+    # Texel and pixel centres lie at integers, areas begin half a unit before.
+    destination = pixels - np.array([window.x0, window.y0])
+    matrix = cv2.getPerspectiveTransform((source - 0.5).astype(np.float32), destination.astype(np.float32))
+    size = (window.x1 - window.x0, window.y1 - window.y0)
+    warped = cv2.warpPerspective(picture, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    finish(target, window, np.asarray(warped, np.uint8), pixels, wall.normal, float(camera_points[:, 2].mean()))
+
+
+def finish(
+    target: Target, window: Window, warped: npt.NDArray[np.uint8], pixels: FloatArray, normal: FloatArray, depth: float
+) -> None:
+    """Light the warped picture, fade it into the haze, cut it to the wall's outline and lay it down."""
+    light = target.light
+    lit = max(0.0, float(normal @ light.sun_direction[:2]))
+    received = light.sky * 0.62 + light.bounce * 0.38 + light.sun * lit
+    share = 1.0 - math.exp(-depth / light.haze_m)
+    lit_picture = cv2.transform(warped, np.column_stack([np.diag(received * (1.0 - share)), light.horizon * share]))
+    size = (window.y1 - window.y0, window.x1 - window.x0)
+    mask = np.zeros(size, np.uint8)
+    cv2.fillConvexPoly(mask, window.pixels(pixels), 255, cv2.LINE_AA, 4)
+    colour = cv2.multiply(lit_picture, cv2.merge([mask, mask, mask]), scale=1.0 / 255.0)
+    composite(target, window, np.asarray(cv2.merge([*cv2.split(colour), mask]), np.uint8), 0)
+
+
+@dataclass(slots=True)
+class Building:
+    """Walls around a footprint; for a house also a roof mesh."""
+
+    s: float
+    walls: tuple[Wall, ...]
+    outline: FloatArray
+    """Footprint [4, 2], world."""
+    height: float
+    roof: Mesh | None
+    pose: Pose
+
+    def distance(self, ego: Pose, camera: Camera) -> float | None:
+        """Distance of the farthest corner, since whatever stands before the walls is nearer than that."""
+        local = ego.to_local(self.outline)
+        half = camera.width / (2.0 * camera.intrinsics.fx) * 1.05
+        aside = (np.abs(local[:, 1]) > half * local[:, 0]).all() and len(set(np.sign(local[:, 1]))) == 1
+        if aside or local[:, 0].max() < NEAREST_WALL_M:
+            return None
+        return float(np.hypot(local[:, 0], local[:, 1]).max())
+
+    def shadow(self, shadows: ShadowLayer) -> None:
+        """The building's cast shadow."""
+        if not shadows.outside(self.pose, 40.0):
+            shadows.throw(self.outline, 0.0, self.height)
+
+    def draw(self, target: Target) -> None:
+        """Walls, then the roof."""
+        for wall in self.walls:
+            draw_wall(target, wall)
+        if self.roof is not None:
+            draw_mesh(target, self.roof, self.pose)
+
+
+def build_building(
+    s: float,
+    pose: Pose,
+    width: float,
+    depth: float,
+    front: Texture,
+    end: Texture,
+    back: Texture,
+    roof: FloatArray | None,
+) -> Building:
+    """A building whose front is centred on `pose`, which looks out to the street.
+
+    The pose's forward axis is the front's outward normal; its right axis runs along the front.
+    """
+    half = width / 2
+    local = np.array([[0.0, half], [0.0, -half], [-depth, -half], [-depth, half]])
+    outline = pose.to_world(local)
+    walls = tuple(
+        Wall(outline[a], outline[b], texture)
+        for a, b, texture in ((2, 3, back), (1, 2, end), (3, 0, end), (0, 1, front))
+    )
+    mesh = build_roof(half, depth, front.height_m, roof) if roof is not None else None
+    return Building(s, walls, outline, front.height_m, mesh, pose)
+
+
+def build_roof(half: float, depth: float, eaves: float, colour: FloatArray) -> Mesh:
+    """A hipped roof with courses of tiles."""
+    builder = MeshBuilder(centre=np.array([-depth / 2, 0.0, eaves]))
+    rise, over = depth * 0.36, 0.35
+    low = np.array(
+        [
+            [over, -half - over, eaves],
+            [over, half + over, eaves],
+            [-depth - over, half + over, eaves],
+            [-depth - over, -half - over, eaves],
+        ]
+    )
+    inner = max(half - depth * 0.4, 0.3)
+    ridge = np.array([[-depth / 2, -inner, eaves + rise], [-depth / 2, inner, eaves + rise]])
+    courses = 14
+    for a, b, c, d in (
+        (low[0], low[1], ridge[1], ridge[0]),
+        (low[2], low[3], ridge[0], ridge[1]),
+        (low[1], low[2], ridge[1], ridge[1]),
+        (low[3], low[0], ridge[0], ridge[0]),
+    ):
+        for course in range(courses):
+            v0, v1 = course / courses, (course + 1) / courses
+            quad = np.array([a + (d - a) * v0, b + (c - b) * v0, b + (c - b) * v1, a + (d - a) * v1])
+            builder.add(quad, colour * (0.88 + 0.2 * ((course * 7) % 3) / 2))
+    builder.box(
+        (-depth * 0.4, half * 0.3, eaves + rise * 0.5),
+        (-depth * 0.4 + 0.7, half * 0.3 + 0.7, eaves + rise + 0.9),
+        colour * 0.7,
+        layer=3,
+    )
+    return builder.build()

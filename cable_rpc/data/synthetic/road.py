@@ -1,0 +1,108 @@
+"""The road's centreline: a smooth plane curve with an arc-length parameter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+STEP_M = 0.5
+START_M = -120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Position (world metres, y to the left of x) and heading (radians, counter-clockwise)."""
+
+    x: float
+    y: float
+    heading: float
+
+    def to_local(self, points: FloatArray) -> FloatArray:
+        """World points [N, 2] or [N, 3] to (forward, right[, up])."""
+        cosine, sine = math.cos(self.heading), math.sin(self.heading)
+        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
+        local = points.copy()
+        local[:, 0] = cosine * dx + sine * dy
+        local[:, 1] = sine * dx - cosine * dy
+        return local
+
+    def to_world(self, points: FloatArray) -> FloatArray:
+        """Points (forward, right[, up]) [N, 2 or 3] to world axes."""
+        cosine, sine = math.cos(self.heading), math.sin(self.heading)
+        world = points.copy()
+        world[:, 0] = self.x + cosine * points[:, 0] + sine * points[:, 1]
+        world[:, 1] = self.y + sine * points[:, 0] - cosine * points[:, 1]
+        return world
+
+
+class Road:
+    """Centreline sampled every half metre; road coordinates are (s along, d to the right)."""
+
+    def __init__(self, rng: np.random.Generator, length_m: float, turn_rad: float, straight_m: float) -> None:
+        """Draw alternating straights and bends until the length is covered.
+
+        Args:
+            rng: Source of all choices.
+            length_m: Drivable length; the curve goes on straight for a while beyond it.
+            turn_rad: Largest heading away from the main direction, which keeps the road free of loops.
+            straight_m: Typical length of the straights.
+        """
+        self.arc = np.arange(START_M, length_m + 500.0, STEP_M)
+        curvature = np.zeros_like(self.arc)
+        position, heading = float(rng.uniform(-30.0, 0.5 * straight_m)), 0.0
+        while position < length_m + 300.0:
+            target = float(rng.uniform(0.35, 1.0) * turn_rad) * (-1.0 if heading > 0 else 1.0)
+            if abs(heading) < 1e-9 and rng.random() < 0.5:
+                target = -target
+            change = target - heading
+            bend = max(18.0, abs(change) * float(rng.uniform(85.0, 140.0)))
+            # A raised-cosine bend has a continuous curvature, so the yaw rate never jumps.
+            inside = (self.arc >= position) & (self.arc < position + bend)
+            phase = (self.arc[inside] - position) / bend
+            curvature[inside] += change / bend * (1.0 - np.cos(2.0 * math.pi * phase))
+            heading = target
+            position += bend + float(rng.uniform(0.2, 0.8)) * straight_m
+        self.curvature = curvature
+        middle = (curvature[1:] + curvature[:-1]) / 2.0
+        self.heading = np.concatenate([[0.0], np.cumsum(middle) * STEP_M])
+        self.heading -= np.interp(0.0, self.arc, self.heading)
+        half = (self.heading[1:] + self.heading[:-1]) / 2.0
+        self.x = np.concatenate([[0.0], np.cumsum(np.cos(half)) * STEP_M])
+        self.y = np.concatenate([[0.0], np.cumsum(np.sin(half)) * STEP_M])
+
+    def curvature_at(self, s: float) -> float:
+        """Curvature in 1/m, positive to the left."""
+        return float(np.interp(s, self.arc, self.curvature))
+
+    def pose(self, s: float, d: float = 0.0, turned: float = 0.0) -> Pose:
+        """The pose at road coordinates (s, d), heading along the road plus `turned` radians."""
+        index = min(max((s - START_M) / STEP_M, 0.0), len(self.arc) - 1.001)
+        low = int(index)
+        share = index - low
+        heading = float(self.heading[low] + share * (self.heading[low + 1] - self.heading[low]))
+        x = float(self.x[low] + share * (self.x[low + 1] - self.x[low]))
+        y = float(self.y[low] + share * (self.y[low + 1] - self.y[low]))
+        return Pose(x + d * math.sin(heading), y - d * math.cos(heading), heading + turned)
+
+    def coordinates(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """World points [N, 2] to road coordinates s [N] and d [N], by the nearest centreline point."""
+        centre = points.mean(axis=0)
+        reach = float(np.abs(points - centre).max()) * 1.5 + 40.0
+        gap = np.hypot(self.x - centre[0], self.y - centre[1])
+        near = np.flatnonzero(gap < max(reach, float(gap.min()) + reach))[::4]
+        squared = (points[:, :1] - self.x[near]) ** 2 + (points[:, 1:] - self.y[near]) ** 2
+        s = self.arc[near[np.argmin(squared, axis=1)]]
+        d = np.zeros_like(s)
+        for _ in range(3):
+            heading = np.interp(s, self.arc, self.heading)
+            dx, dy = points[:, 0] - np.interp(s, self.arc, self.x), points[:, 1] - np.interp(s, self.arc, self.y)
+            d = np.sin(heading) * dx - np.cos(heading) * dy
+            along = np.cos(heading) * dx + np.sin(heading) * dy
+            bend = np.maximum(1.0 + np.interp(s, self.arc, self.curvature) * d, 0.4)
+            s = s + np.clip(along / bend, -3.0, 3.0)
+        return s, d

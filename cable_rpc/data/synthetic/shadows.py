@@ -1,0 +1,88 @@
+"""Soft shadows on the ground."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cable_rpc.data.synthetic.camera import NEAR_PLANE_M
+from cable_rpc.data.synthetic.raster import SUBPIXEL, SUBPIXEL_BITS, Target, clip_near
+from cable_rpc.data.synthetic.road import Pose
+
+UInt8Array = npt.NDArray[np.uint8]
+FloatArray = npt.NDArray[np.float64]
+
+SHRINK = 2
+SHADOWS_M = 60.0
+
+
+class ShadowLayer:
+    """A coarse darkness image, blurred and multiplied onto the ground."""
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+        camera = target.camera
+        self.top = max(0, min(camera.height - 1, int(camera.horizon_row)))
+        height, width = -(-(camera.height - self.top) // SHRINK), -(-camera.width // SHRINK)
+        self.contact: UInt8Array = np.zeros((height, width), np.uint8)
+        self.cast: UInt8Array = np.zeros((height, width), np.uint8)
+
+    def fill(self, mask: UInt8Array, outline: FloatArray, strength: int) -> None:
+        """Darken a convex ground polygon [N, 2] given in vehicle axes."""
+        flat = np.column_stack([outline, np.zeros(len(outline))])
+        points = self.target.camera.to_camera(flat)
+        if points[:, 2].min() < NEAR_PLANE_M:
+            points = clip_near(points)
+            if len(points) < 3:
+                return
+        pixels = self.target.camera.image_points(points)
+        fixed = ((pixels - np.array([0.0, self.top])) / SHRINK * SUBPIXEL).clip(-60000, 120000)
+        cv2.fillConvexPoly(mask, fixed.astype(np.int32), strength, cv2.LINE_8, SUBPIXEL_BITS)
+
+    def add_box(self, pose: Pose, length: float, width: float, height: float) -> None:
+        """The contact shadow under an object and the shadow its box throws from the sun."""
+        if self.outside(pose, max(length, height * 2)):
+            return
+        for grow, strength in ((0.22, 90), (0.05, 190)):
+            self.fill(
+                self.contact, self.target.ego.to_local(pose.to_world(rectangle(length + grow, width + grow))), strength
+            )
+        self.throw(pose.to_world(rectangle(length * 0.94, width * 0.94)), 0.1, height * 0.94)
+
+    def throw(self, base: FloatArray, low: float, high: float) -> None:
+        """The cast shadow of a prism over the world polygon [N, 2] between two heights."""
+        light = self.target.light
+        if light.shadow <= 0.15:
+            return
+        rise = max(float(light.sun_direction[2]), 0.18)
+        slope = -light.sun_direction[:2] / rise
+        outline = np.vstack([base + slope * low, base + slope * high])
+        hull = cv2.convexHull(outline.astype(np.float32))[:, 0].astype(np.float64)
+        self.fill(self.cast, self.target.ego.to_local(hull), 255)
+
+    def outside(self, pose: Pose, reach: float) -> bool:
+        """Whether nothing near the pose can reach the image."""
+        x, y = pose.x - self.target.ego.x, pose.y - self.target.ego.y
+        forward = math.cos(self.target.ego.heading) * x + math.sin(self.target.ego.heading) * y
+        right = math.sin(self.target.ego.heading) * x - math.cos(self.target.ego.heading) * y
+        half = self.target.camera.width / (2.0 * self.target.camera.intrinsics.fx)
+        return forward < -reach or forward > SHADOWS_M or abs(right) > half * max(forward, 0.0) + 2.0 * reach
+
+    def apply(self) -> None:
+        """Blur and multiply onto the image."""
+        image = self.target.image[self.top :]
+        size = (image.shape[1], image.shape[0])
+        contact = cv2.GaussianBlur(self.contact, (0, 0), 2.6 * image.shape[1] / 960.0 * 2 / SHRINK)
+        cast = cv2.GaussianBlur(self.cast, (0, 0), 1.3 * image.shape[1] / 960.0 * 2 / SHRINK)
+        light = 255.0 * (1.0 - cast * (self.target.light.shadow / 255.0)) * (1.0 - contact * (0.85 / 255.0))
+        kept = cv2.resize(light.astype(np.uint8), size, interpolation=cv2.INTER_LINEAR)
+        image[:] = cv2.multiply(image, cv2.merge([kept, kept, kept]), scale=1.0 / 255.0)
+
+
+def rectangle(length: float, width: float) -> FloatArray:
+    """Corners [4, 2] of a rectangle around the origin, forward and right."""
+    x, y = length / 2, width / 2
+    return np.array([[-x, -y], [x, -y], [x, y], [-x, y]])

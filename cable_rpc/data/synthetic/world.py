@@ -1,0 +1,103 @@
+"""The world of one seed and its pictures."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cable_rpc.data.synthetic.actors import KIND_LENGTHS, KIND_SHARES, actor_pose
+from cable_rpc.data.synthetic.camera import Camera
+from cable_rpc.data.synthetic.ground import Ground
+from cable_rpc.data.synthetic.groundpaint import GroundPainter
+from cable_rpc.data.synthetic.population import populate
+from cable_rpc.data.synthetic.raster import Target
+from cable_rpc.data.synthetic.render import Drawn, collect_truth
+from cable_rpc.data.synthetic.road import Pose, Road
+from cable_rpc.data.synthetic.scenario import draw_scenario
+from cable_rpc.data.synthetic.scenery import Prop, build_scenery
+from cable_rpc.data.synthetic.sensor import Sensor
+from cable_rpc.data.synthetic.shadows import ShadowLayer
+from cable_rpc.data.synthetic.sky import Sky
+from cable_rpc.data.synthetic.traffic import simulate
+from cable_rpc.types import EgoMotion, GroundTruth, Image
+
+VIEW_AHEAD_M = 170.0
+ACTORS_AHEAD_M = 105.0
+VIEW_BEHIND_M = 14.0
+SKYLINES_RAD = {"city": 0.05, "boulevard": 0.05, "suburb": 0.035, "country": 0.03}
+
+
+class World:
+    """Everything that is fixed by the seed; `render` is a pure function of time."""
+
+    def __init__(
+        self, seed: int, camera: Camera, duration_s: float, noise: float, blur: float, vignette: float
+    ) -> None:
+        self.camera = camera
+        self.street, self.light = draw_scenario(seed)
+        rng = np.random.default_rng([seed, 1])
+        travel = duration_s * self.street.cruise_mps * 1.15
+        self.road = Road(rng, travel + 60.0, self.street.turn_rad, self.street.straight_m)
+        self.traffic = simulate(rng, self.road, self.street, duration_s, KIND_LENGTHS, KIND_SHARES)
+        self.reach_m = float(self.traffic.s[-1, 0]) + VIEW_AHEAD_M + 10.0
+        self.actors = populate(rng, self.street, self.traffic, self.reach_m)
+        painter = GroundPainter(rng, self.road, self.street, self.light, self.traffic.crossings)
+        self.ground = Ground(camera, painter)
+        self.sky = Sky(rng, camera, self.light, SKYLINES_RAD[self.street.name])
+        self.props: list[Prop] = build_scenery(
+            rng, self.road, self.street, self.light, self.traffic.crossings, self.reach_m
+        )
+        self.prop_s = np.array([prop.s for prop in self.props])
+        self.sensor = Sensor(seed, camera.width, camera.height, noise, blur, vignette)
+
+    def ego(self, time_s: float) -> tuple[Pose, EgoMotion]:
+        """Pose and motion of the ego vehicle at a time."""
+        s, speed = self.traffic.at(time_s)
+        d = float(self.traffic.lateral[0])
+        curvature = self.road.curvature_at(float(s[0]))
+        yaw_rate = float(speed[0]) * curvature / (1.0 + curvature * d)
+        return self.road.pose(float(s[0]), d), EgoMotion(float(speed[0]), 0.0, yaw_rate)
+
+    def may_be_seen(self, ego: Pose, where: Pose, reach_m: float) -> bool:
+        """Whether something within `reach_m` of a pose can be in the horizontal field of view."""
+        forward, right = ego.to_local(np.array([[where.x, where.y]]))[0]
+        half = self.camera.width / (2.0 * self.camera.intrinsics.fx)
+        return bool(forward > -reach_m and abs(right) < half * max(forward, 0.0) + 1.5 * reach_m)
+
+    def render(self, time_s: float, index: int) -> tuple[Image, GroundTruth]:
+        """The camera frame and its truth at a time; `index` chooses the sensor noise."""
+        camera, pose = self.camera, self.ego(time_s)[0]
+        image = np.zeros((camera.height, camera.width, 3), np.uint8)
+        target = Target(image, np.zeros((camera.height, camera.width), np.int32), camera, self.light, pose)
+        self.sky.render(image, pose.heading)
+        self.ground.render(image, pose)
+        ego_s = float(self.traffic.at(time_s)[0][0])
+        near = np.flatnonzero((self.prop_s > ego_s - 40.0) & (self.prop_s < ego_s + VIEW_AHEAD_M + 40.0))
+        props = [self.props[int(index)] for index in near]
+        shadows = ShadowLayer(target)
+        queue: list[tuple[float, int, Prop | None, int, Pose]] = []
+        for place, prop in enumerate(props):
+            distance = prop.distance(pose, camera)
+            if distance is not None:
+                queue.append((distance, place, prop, 0, pose))
+            prop.shadow(shadows)
+        for number, actor in enumerate(self.actors):
+            placement = actor.place(time_s)
+            if not ego_s - VIEW_BEHIND_M < placement.s < ego_s + ACTORS_AHEAD_M:
+                continue
+            where = actor_pose(self.road, placement)
+            distance = math.hypot(where.x - pose.x, where.y - pose.y)
+            if self.may_be_seen(pose, where, max(actor.footprint)):
+                queue.append((distance, number, None, number + 1, where))
+            shadows.add_box(where, *actor.footprint, actor.height)
+        shadows.apply()
+        queue.sort(key=lambda entry: (-entry[0], entry[3], entry[1]))
+        drawn: list[Drawn] = []
+        for _, _, scenery, ident, where in queue:
+            if scenery is not None:
+                scenery.draw(target)
+            else:
+                actor = self.actors[ident - 1]
+                drawn.append(Drawn(actor, ident, actor.draw(target, where, time_s, ident)))
+        return self.sensor.expose(image, index), collect_truth(target.ids, drawn)

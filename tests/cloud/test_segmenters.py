@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cable_rpc.cloud.backends import BackendOptions, FrameContext, load_segmenter
+from cable_rpc.cloud.segmenters import BoxSegmenter
+from cable_rpc.data.synthetic import SyntheticConfig, SyntheticSource
+from cable_rpc.errors import ConfigurationError, FrameError
+from cable_rpc.types import Detections
+
+HEIGHT, WIDTH = 20, 30
+coordinate = st.floats(-15, 45, width=32)
+
+
+@given(st.lists(st.tuples(coordinate, coordinate, coordinate, coordinate), max_size=4))
+def test_boxes_cover_every_pixel_they_touch_and_no_other(corners: list[tuple[float, float, float, float]]) -> None:
+    boxes = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d in corners]
+    detections = Detections(
+        np.array(boxes, np.float32).reshape(-1, 4),
+        np.full(len(boxes), 2, np.int32),
+        np.full(len(boxes), 0.5, np.float32),
+    )
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    found = BoxSegmenter().segment(image, np.ones((HEIGHT, WIDTH), np.bool_), "", FrameContext(0, detections))
+    for y in range(HEIGHT):
+        for x in range(WIDTH):
+            touched = any(
+                np.floor(x0) <= x < np.ceil(x1) and np.floor(y0) <= y < np.ceil(y1) for x0, y0, x1, y1 in boxes
+            )
+            assert found.mask[y, x] == touched
+
+
+def test_oracle_answers_with_the_world_s_own_masks() -> None:
+    oracle = load_segmenter("oracle:synthetic:3", BackendOptions())
+    frame = SyntheticSource(SyntheticConfig(seed=3)).frame(2)
+    assert frame.truth is not None
+    assert frame.truth.instance_mask is not None
+    roi = np.ones(frame.size_hw, np.bool_)
+    answer = oracle.segment(frame.image, roi, "", FrameContext(2, Detections.empty()))
+    assert np.array_equal(answer.mask, frame.truth.instance_mask > 0)
+    with pytest.raises(FrameError, match="same source and size"):
+        oracle.segment(frame.image[:100], roi[:100], "", FrameContext(2, Detections.empty()))
+
+
+def test_oracle_of_a_plain_video_is_refused(shared_clip: object) -> None:
+    with pytest.raises(ConfigurationError, match="random access and ground truth"):
+        load_segmenter(f"oracle:video:{shared_clip}", BackendOptions())
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"), [("lisa:folder", "installed: boxes, oracle"), ("boxes:7", "no argument"), ("oracle", "oracle:")]
+)
+def test_unusable_names_are_explained(spec: str, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        load_segmenter(spec, BackendOptions())
