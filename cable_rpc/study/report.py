@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cable_rpc.errors import ConfigurationError
-from cable_rpc.study.metrics import Scores
 from cable_rpc.study.run_record import (
     FRAMES_FILE,
     REPORT_FILE,
@@ -20,13 +19,7 @@ from cable_rpc.study.run_record import (
     write_text,
 )
 from cable_rpc.study.summary import RunSummary, honesty_notes, summarise
-
-LAYER_LABELS = {
-    "bitstream": "coded picture · mask",
-    "with_roi": "+ region",
-    "message": "whole message",
-    "transport": "transport",
-}
+from cable_rpc.study.summary_table import layer_label, percent, quality_rows, whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +91,8 @@ def tiles_of(summary: RunSummary) -> list[Tile]:
         Tile("pixels not sent", percent(summary.pixel_saving), "a share of the picture, no measure of bytes"),
         Tile(
             "uplink",
-            f"{number(message.uplink_kbps)} kbit/s",
-            f"{number(message.uplink_bytes_per_frame)} bytes a frame at {summary.info.fps:g} fps",
+            f"{whole(message.uplink_kbps)} kbit/s",
+            f"{whole(message.uplink_bytes_per_frame)} bytes a frame at {summary.info.fps:g} fps",
         ),
     ]
     if end_to_end is not None:
@@ -124,53 +117,18 @@ def tiles_of(summary: RunSummary) -> list[Tile]:
 
 def layer_rows(summary: RunSummary) -> list[tuple[str, ...]]:
     """Bytes per frame and kbit/s by layer."""
-    rows = []
-    for layer in summary.layers:
-        label = LAYER_LABELS.get(layer.layer, layer.layer)
-        if layer.layer == "transport":
-            label = f"{label} ({summary.info.transport_source})"
-        rows.append(
-            (
-                label,
-                number(layer.uplink_bytes_per_frame),
-                number(layer.uplink_kbps),
-                number(layer.downlink_bytes_per_frame),
-                number(layer.downlink_kbps),
-                number(layer.full_frame_bytes_per_frame),
-                percent(layer.byte_saving),
-            )
+    return [
+        (
+            layer_label(layer, summary.info.transport_source),
+            whole(layer.uplink_bytes_per_frame),
+            whole(layer.uplink_kbps),
+            whole(layer.downlink_bytes_per_frame),
+            whole(layer.downlink_kbps),
+            whole(layer.full_frame_bytes_per_frame),
+            percent(layer.byte_saving),
         )
-    return rows
-
-
-def quality_rows(summary: RunSummary) -> list[tuple[str, str, str]]:
-    """Figure, value, meaning."""
-    quality = summary.quality
-    rows = [
-        ("region R_k", percent(summary.coverage_roi), "of the picture, keyframes included (the paper's coverage)"),
-        ("sent", percent(summary.coverage_tx), "of the picture, frames sent whole counted as whole"),
-        ("frames sent whole", percent(summary.keyframe_rate), "of the frames sent"),
-        ("detection retention", percent(quality.retention), "of full-frame detections, pooled"),
-        ("spurious", percent(quality.spurious_rate), "of ROI-only detections, absent on full frames"),
+        for layer in summary.layers
     ]
-    if quality.roi_psnr_db is not None:
-        rows.append(("PSNR in the region", f"{quality.roi_psnr_db:.1f} dB", "luma, decoded against camera"))
-    if quality.truth_count:
-        rows += [
-            (f"recognition at {100 * level:.0f} %", percent(value), "of visible objects, by share of the box sent")
-            for level, value in quality.recognition
-        ]
-    rows += score_rows(quality.micro, "pooled over the run, IoU 0.5")
-    rows += score_rows(quality.macro_frame, "mean over frames (the paper's way)")
-    return rows
-
-
-def score_rows(scores: Scores | None, meaning: str) -> list[tuple[str, str, str]]:
-    """Recall, precision and F1 as one row."""
-    if scores is None:
-        return []
-    value = " / ".join(percent(part) for part in (scores.recall, scores.precision, scores.f1))
-    return [("recall / precision / F1", value, meaning)]
 
 
 def environment_rows(info: RunInfo) -> list[tuple[str, str]]:
@@ -206,13 +164,3 @@ def still_pairs(folder: Path) -> list[StillPair]:
 def data_uri(path: Path) -> str:
     """A JPEG file as a data URI."""
     return "data:image/jpeg;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-def percent(value: float | None) -> str:
-    """A share as a percentage."""
-    return "–" if value is None else f"{100 * value:.1f} %"
-
-
-def number(value: float | None) -> str:
-    """A rounded number with thin spaces between thousands."""
-    return "–" if value is None else f"{value:,.0f}".replace(",", "\u202f")

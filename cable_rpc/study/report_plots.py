@@ -153,9 +153,9 @@ def quality_plot(sent: Sequence[FrameRecord]) -> Plot | None:
     recall = [(record.index, counts) for record, counts in scored if counts is not None]
     if recall:
         windows = [recall[max(0, i - WINDOW + 1) : i + 1] for i in range(len(recall))]
-        y = [share(sum(c[0] for _, c in window), sum(c[1] for _, c in window)) for window in windows]
+        shares = [share(sum(c[0] for _, c in window), sum(c[1] for _, c in window)) for window in windows]
         x_recall = [index for index, _ in recall]
-        figure.add_scatter(x=x_recall, y=y, name="recall", mode="lines", line={"color": GREEN, "width": 1.6})
+        figure.add_scatter(x=x_recall, y=shares, name="recall", mode="lines", line={"color": GREEN, "width": 1.6})
     if not figure.data:
         return None
     figure.update_yaxes(range=[0, 103])
