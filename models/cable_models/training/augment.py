@@ -1,0 +1,135 @@
+"""Random changes of training images that leave their labels true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cable_models.detection import Float32Array, Image
+from cable_models.training.samples import LabelledImage
+
+MIN_KEPT_AREA = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class AugmentConfig:
+    """How often and how strongly images are changed."""
+
+    flip: float = 0.5
+    crop: float = 0.6
+    min_crop: float = 0.55
+    """Smallest crop as a share of the image's width and height."""
+    colour: float = 0.8
+    blacken: float = 0.35
+    """Share of images of which only a region around the objects is kept, as an edge uploads them."""
+    jpeg: float = 0.4
+
+
+def augment(
+    sample: LabelledImage, size_wh: tuple[int, int], config: AugmentConfig, rng: np.random.Generator
+) -> LabelledImage:
+    """A changed copy, resized to ``size_wh`` pixels; objects mostly lost to a crop or a fill are dropped."""
+    sample = random_crop(sample, size_wh, config, rng)
+    if rng.random() < config.flip:
+        sample = mirrored(sample)
+    image = sample.image
+    if rng.random() < config.colour:
+        image = jitter_colour(image, rng)
+    sample = LabelledImage(image, sample.boxes_xyxy, sample.class_ids, sample.visibility)
+    if rng.random() < config.blacken:
+        sample = keep_region(sample, rng)
+    if rng.random() < config.jpeg:
+        recoded = jpeg_recoded(sample.image, int(rng.integers(20, 90)))
+        sample = LabelledImage(recoded, sample.boxes_xyxy, sample.class_ids, sample.visibility)
+    return sample
+
+
+def random_crop(
+    sample: LabelledImage, size_wh: tuple[int, int], config: AugmentConfig, rng: np.random.Generator
+) -> LabelledImage:
+    """A random part of the image (or all of it) at the wanted size, aspect ratio jittered by up to 15 %."""
+    height, width = sample.image.shape[:2]
+    crop_h, crop_w = height, width
+    if rng.random() < config.crop:
+        share = rng.uniform(config.min_crop, 1.0)
+        crop_h = int(height * min(1.0, share * rng.uniform(0.85, 1.15)))
+        crop_w = int(width * share)
+    x = int(rng.integers(0, width - crop_w + 1))
+    y = int(rng.integers(0, height - crop_h + 1))
+    part = sample.image[y : y + crop_h, x : x + crop_w]
+    image = cv2.resize(part, size_wh, interpolation=cv2.INTER_LINEAR)
+    scale = np.array([size_wh[0] / crop_w, size_wh[1] / crop_h] * 2, np.float32)
+    moved = (sample.boxes_xyxy - np.array([x, y, x, y], np.float32)) * scale
+    clipped = np.clip(moved, 0, np.array([*size_wh, *size_wh], np.float32))
+    kept = area(clipped) >= MIN_KEPT_AREA * np.maximum(area(moved), 1e-6)
+    return LabelledImage(np.asarray(image, np.uint8), clipped[kept], sample.class_ids[kept], sample.visibility[kept])
+
+
+def mirrored(sample: LabelledImage) -> LabelledImage:
+    """Left and right exchanged."""
+    width = sample.image.shape[1]
+    boxes = sample.boxes_xyxy.copy()
+    boxes[:, [0, 2]] = width - sample.boxes_xyxy[:, [2, 0]]
+    return LabelledImage(np.ascontiguousarray(sample.image[:, ::-1]), boxes, sample.class_ids, sample.visibility)
+
+
+def jitter_colour(image: Image, rng: np.random.Generator) -> Image:
+    """Random brightness, contrast, gamma, white balance and saturation."""
+    grey_level = np.linspace(0, 1, 256, dtype=np.float32)
+    curve = grey_level ** rng.uniform(0.7, 1.5)
+    curve = (curve - 0.5) * rng.uniform(0.7, 1.3) + 0.5 + rng.uniform(-0.15, 0.15)
+    table = curve[:, None] * rng.uniform(0.92, 1.08, 3)
+    table8 = np.clip(table * 255, 0, 255).astype(np.uint8)[None]
+    toned = cv2.LUT(image, table8)
+    grey = cv2.cvtColor(cv2.cvtColor(toned, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    saturation = rng.uniform(0.4, 1.4)
+    return np.asarray(cv2.addWeighted(toned, saturation, grey, 1 - saturation, 0), np.uint8)
+
+
+def keep_region(sample: LabelledImage, rng: np.random.Generator) -> LabelledImage:
+    """Fills all but a region around some of the objects, on an 8x8 grid, as the upload of an edge looks."""
+    height, width = sample.image.shape[:2]
+    rows, columns = -(-height // 8), -(-width // 8)
+    region = np.zeros((rows, columns), np.bool_)
+    margin = rng.uniform(2, 40)
+    seen = rng.random(len(sample.boxes_xyxy)) < 0.92
+    for x0, y0, x1, y1 in grown_blocks(sample.boxes_xyxy[seen], margin):
+        region[y0:y1, x0:x1] = True
+    if rng.random() < 0.5 and region.any():
+        occupied = np.flatnonzero(region.any(axis=1))
+        region[occupied[0] : occupied[-1] + 1] |= region.any(axis=0) | (rng.random() < 0.5)
+    pixels = region.repeat(8, axis=0).repeat(8, axis=1)[:height, :width]
+    fill = (0, 128, int(sample.image.mean()))[int(rng.choice(3, p=[0.6, 0.25, 0.15]))]
+    image = np.where(pixels[..., None], sample.image, np.uint8(fill))
+    kept = covered_share(sample.boxes_xyxy, pixels) >= MIN_KEPT_AREA
+    return LabelledImage(image, sample.boxes_xyxy[kept], sample.class_ids[kept], sample.visibility[kept])
+
+
+def grown_blocks(boxes_xyxy: Float32Array, margin: float) -> list[list[int]]:
+    """Boxes grown by ``margin`` pixels, in whole 8x8 blocks, as x0, y0, x1, y1."""
+    low = np.maximum(np.floor((boxes_xyxy[:, :2] - margin) / 8), 0)
+    high = np.ceil((boxes_xyxy[:, 2:] + margin) / 8)
+    blocks: list[list[int]] = np.concatenate([low, high], axis=1).astype(int).tolist()
+    return blocks
+
+
+def covered_share(boxes_xyxy: Float32Array, pixels: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Float32Array:
+    """Share of each box's pixels inside a mask, by its integral image, float32 [N]."""
+    height, width = pixels.shape
+    integral = cv2.integral(pixels.astype(np.uint8))
+    x0, y0, x1, y1 = np.clip(np.round(boxes_xyxy).astype(int), 0, [width, height, width, height]).T
+    inside = integral[y1, x1] - integral[y0, x1] - integral[y1, x0] + integral[y0, x0]
+    return np.asarray(inside / np.maximum((x1 - x0) * (y1 - y0), 1), np.float32)
+
+
+def jpeg_recoded(image: Image, quality: int) -> Image:
+    """The image after JPEG at the given quality."""
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
+def area(boxes_xyxy: Float32Array) -> Float32Array:
+    """Area of each box in square pixels, float32 [N]."""
+    return np.asarray(np.clip(boxes_xyxy[:, 2:] - boxes_xyxy[:, :2], 0, None).prod(axis=1), np.float32)
