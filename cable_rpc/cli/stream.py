@@ -54,7 +54,7 @@ def stream(
     block_size: Annotated[int, typer.Option(help="Grid that the region is grown to; 1 = exact.", min=1)] = 8,
     prompt: Annotated[str, typer.Option(help="Sentence for an open-vocabulary segmenter.")] = "",
     min_score: Annotated[
-        float, typer.Option(help="Detections below are not sent; can only raise the server's setting.", min=0.0, max=1.0)
+        float, typer.Option(help="Detections below are not sent; can only raise the server's.", min=0.0, max=1.0)
     ] = 0.0,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the server.", min=0.1)] = 10.0,
     client_id: Annotated[str, typer.Option(help="Name of this camera in the server's logs.")] = "",

@@ -102,7 +102,8 @@ class PerceptionSession:
                     task.cancel()
             await asyncio.gather(reader, inference, return_exceptions=True)
             if self._decoder is not None:
-                self._decoder.close()
+                # Cancelling the reader does not stop a decode under way: closing waits for it, off the loop.
+                await asyncio.to_thread(self._decoder.close)
 
     def drain(self, status: status_pb2.Status, action: pb.CloseAction) -> None:
         """Tells the client to go; pending frames are still answered, new ones are ignored."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 from cable_codecs import CodecError, CodecParameters, Decoder, create_decoder, fill_background
@@ -55,6 +56,7 @@ class StreamDecoder:
             self._decoder: Decoder = create_decoder(parameters)
         except CodecError as error:
             raise ProtocolError(str(error)) from error
+        self._in_use = threading.Lock()
         self._lost = False
         self.last_good_sequence: int | None = None
 
@@ -76,7 +78,8 @@ class StreamDecoder:
         roi = self._region(frame)
         self._check_reference(frame)
         try:
-            image = self._decoder.decode(frame.data)
+            with self._in_use:
+                image = self._decoder.decode(frame.data)
         except CodecError as error:
             self.mark_lost()
             raise FrameRejection(
@@ -89,8 +92,9 @@ class StreamDecoder:
         return DecodedFrame(fill_background(image, roi, "zero"), roi)
 
     def close(self) -> None:
-        """Frees the codec."""
-        self._decoder.close()
+        """Frees the codec, after a decode that is still running in another thread."""
+        with self._in_use:
+            self._decoder.close()
 
     def _region(self, frame: pb.VideoFrame) -> BoolMask | None:
         if not frame.HasField("region"):

@@ -32,7 +32,8 @@ class EdgeStreamer:
     """Streams one capture through one session.
 
     The client's credit bounds what is in flight. A frame is taken from the camera only when there is a place for
-    it, so in real time it is always the newest, and frames are dropped before the encoder, never after.
+    it, so in real time it is always the newest, and frames are dropped before the encoder, never after. The
+    streamer closes the encoder when it is done.
     """
 
     def __init__(self, capture: Capture, encoder: FrameEncoder, client: PerceptionClient) -> None:
@@ -70,6 +71,7 @@ class EdgeStreamer:
             sender.cancel()
             await asyncio.gather(sender, return_exceptions=True)
             self._worker.shutdown(wait=True)
+            self._encoder.close()
 
     async def _send_all(self) -> None:
         loop = asyncio.get_running_loop()

@@ -118,6 +118,16 @@ def test_real_clip_through_two_processes(shared_clip: Path, shared_detector: Pat
     assert sum(record.detection_count or 0 for record in records) > 0
 
 
+def test_demo_runs_the_embedded_models(tmp_path: Path) -> None:
+    done = cable_rpc("demo", "--frames", "8", "--out", str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "bytes saved" in done.stdout
+    assert "recognition at 50%" in done.stdout
+    for name in ("frames.csv", "summary.json", "annotated.mp4", "report.html"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert [record.outcome for record in read_frames(tmp_path / "frames.csv")] == ["answered"] * 8
+
+
 @contextmanager
 def stream_under_way(target: str, clip: Path, out: Path) -> Iterator[subprocess.Popen[str]]:
     """A streaming process that has some frames behind it."""

@@ -303,6 +303,18 @@ async def test_silence_is_broken_by_heartbeats(running_server: Any, stub_for: An
         call.cancel()
 
 
+async def test_clients_that_vanish_mid_frame_leave_the_server_whole(running_server: Any, stub_for: Any) -> None:
+    """Each cancels while its frame is being decoded or perceived."""
+    packet = coded("h264", 1, 640, 480)[0]
+    async with running_server() as target, stub_for(target) as stub:
+        for wait_s in (0.0, 0.001, 0.003, 0.01) * 5:
+            call = await opened(stub, hello(pb.CODEC_H264, 640, 480))
+            await call.write(frame(0, packet))
+            await asyncio.sleep(wait_s)
+            call.cancel()
+        await serves_a_frame(stub)
+
+
 async def test_client_that_says_nothing_is_sent_away(running_server: Any, stub_for: Any) -> None:
     limits = SessionLimits(hello_timeout_s=0.1, close_timeout_s=1.0)
     async with running_server(limits=limits) as target, stub_for(target) as stub:
