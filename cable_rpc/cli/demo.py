@@ -23,8 +23,8 @@ START_TIMEOUT_S = 60.0
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
-    seed: Annotated[int, typer.Option(help="Seed of the rendered driving clip.")] = 7,
-    frames: Annotated[int, typer.Option(help="Length of the clip.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the rendered driving clip.")] = 8,
+    frames: Annotated[int, typer.Option(help="Length of the clip.", min=1)] = 80,
     codec: Annotated[str, typer.Option(help="h264 | jpeg | webp.")] = "h264",
 ) -> None:
     """Stream a rendered driving clip edge -> codec -> gRPC -> models -> mask -> edge, and show what it cost."""
