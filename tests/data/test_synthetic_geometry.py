@@ -66,8 +66,23 @@ def flipped(heading: float) -> np.ndarray:
 
 
 def test_rendered_road_follows_the_homography() -> None:
-    """The picture itself, not only the formula: warp one frame's road onto the next."""
-    clip = source(3, width=640, height=360, blur_sigma=0.0, vignette=0.0)
+    """The picture itself, not only the formula: patches of road move as predicted, to a small part of a pixel.
+
+    One frame's road warped onto the next by the homography differs from it in grey value, since grain is
+    filtered to the pixel's footprint and gets finer on approach. It does not differ in place: phase
+    correlation finds no common offset (below 0.1 pixels over all patches of all clips) and no patch that is
+    typically displaced by 0.3 pixels, so textures have the right origin at every level.
+    """
+    offsets = np.vstack([road_displacements(seed) for seed in (2, 3, 5)])
+    assert len(offsets) >= 40
+    assert np.abs(np.median(offsets, axis=0)).max() < 0.1
+    assert np.median(np.hypot(*offsets.T)) < 0.3
+    assert np.quantile(np.hypot(*offsets.T), 0.9) < 0.4
+
+
+def road_displacements(seed: int) -> np.ndarray:
+    """Rendered minus predicted motion [N, 2] in pixels of road patches between the two frames of fastest travel."""
+    clip = source(seed, width=640, height=360, blur_sigma=0.0, vignette=0.0)
     camera = clip.camera
     index = max(range(20, 100), key=lambda i: clip.world.ego(i / 10)[1].speed_mps)
     frames = [clip.frame(index), clip.frame(index + 1)]
@@ -76,19 +91,23 @@ def test_rendered_road_follows_the_homography() -> None:
     world = poses[0].to_world(corners)
     before, after = (camera.project(pose.to_local(world))[0].astype(np.float32) for pose in poses)
     matrix = cv2.getPerspectiveTransform(before, after)
-    warped = cv2.warpPerspective(frames[0].image, matrix, (640, 360))
-    inside = cv2.fillConvexPoly(np.zeros((360, 640), np.uint8), np.round(after).astype(np.int32), 1) > 0
-    inside[350:] = False
+    grey = [cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY).astype(np.float32) for frame in frames]
+    warped = cv2.warpPerspective(grey[0], matrix, (640, 360), flags=cv2.INTER_CUBIC)
+    known = cv2.warpPerspective(np.ones((360, 640), np.uint8), matrix, (640, 360)) > 0
     for frame in frames:
         assert frame.truth is not None
         assert frame.truth.instance_mask is not None
-    inside &= frames[1].truth.instance_mask == 0  # type: ignore[union-attr]
-    # Grain is filtered to the pixel's footprint, which shrinks on approach: compare what both frames resolve.
-    first, warped, second = (cv2.GaussianBlur(p, (0, 0), 2.5) for p in (frames[0].image, warped, frames[1].image))
-    difference = np.abs(warped.astype(float) - second)[inside]
-    still = np.abs(first.astype(float) - second)[inside]
-    assert np.median(difference) <= 2.0
-    assert difference.mean() < 0.6 * still.mean()
+    free = known & (frames[1].truth.instance_mask == 0)  # type: ignore[union-attr]
+    side, found = 48, []
+    window = cv2.createHanningWindow((side, side), cv2.CV_32F)
+    for forward in (5.0, 6.0, 7.0, 8.0, 10.0, 12.0):
+        for right in (-1.5, -0.8, 0.0, 0.8, 1.5):
+            middle = camera.project(np.array([[forward, right, 0.0]]))[0][0]
+            x, y = (int(value) - side // 2 for value in middle)
+            part = (slice(y, y + side), slice(x, x + side))
+            if 0 <= x <= 640 - side and 0 <= y <= 360 - side and free[part].all():
+                found.append(cv2.phaseCorrelate(warped[part], grey[1][part], window)[0])
+    return np.array(found).reshape(-1, 2)
 
 
 def test_pose_integrates_speed_and_yaw_rate() -> None:
@@ -111,6 +130,8 @@ def test_pose_integrates_speed_and_yaw_rate() -> None:
 def test_left_turn_moves_far_scenery_to_the_right() -> None:
     checked = 0
     for seed in range(8):
+        if checked >= 3:
+            break
         clip = source(seed)
         rates = [clip.world.ego(i / 10)[1].yaw_rate_radps for i in range(119)]
         index = int(np.argmax(np.abs(rates)))

@@ -47,14 +47,14 @@ def test_same_seed_same_frames_in_any_order() -> None:
 
 
 def test_seeds_differ() -> None:
-    pictures = [small(seed).frame(0).image for seed in (0, 4, 8)]
+    pictures = [small(seed).frame(0).image for seed in (0, 1, 3)]
     for a, b in ((0, 1), (1, 2), (0, 2)):
         assert np.abs(pictures[a].astype(int) - pictures[b]).mean() > 5.0
 
 
 def test_noise_is_new_in_every_frame_and_absent_when_off() -> None:
-    still = small(2, noise_strength=0.0, frame_count=2)
-    noisy = small(2, noise_strength=3.0, frame_count=2)
+    still = small(3, noise_strength=0.0, frame_count=2)
+    noisy = small(3, noise_strength=3.0, frame_count=2)
     residual = [noisy.frame(i).image.astype(float) - still.frame(i).image for i in (0, 1)]
     inner = [part[40:140, 40:280].ravel() for part in residual]
     assert 0.5 < inner[0].std() < 8.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -12,13 +12,16 @@ import numpy.typing as npt
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.facades import TEXELS_PER_M, Texture
 from cable_rpc.data.synthetic.mesh import Mesh, MeshBuilder
-from cable_rpc.data.synthetic.raster import Target, Window, composite, draw_mesh, window_around
+from cable_rpc.data.synthetic.raster import Target, Window, blend, draw_mesh, mark, window_around
 from cable_rpc.data.synthetic.road import Pose
 from cable_rpc.data.synthetic.shadows import ShadowLayer
 
 FloatArray = npt.NDArray[np.float64]
 
 NEAREST_WALL_M = 1.0
+SHADOW_REACH_M = 40.0
+PARTY_GAP_M = 0.1
+PARTY_STEP_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +31,17 @@ class Wall:
     start: FloatArray
     stop: FloatArray
     texture: Texture
+    normal: FloatArray = field(init=False)
+    """Outward unit normal in the ground plane."""
 
-    @property
-    def normal(self) -> FloatArray:
-        """Outward unit normal in the ground plane."""
+    def __post_init__(self) -> None:
         along = self.stop - self.start
-        return np.array([along[1], -along[0]]) / float(np.linalg.norm(along))
+        object.__setattr__(self, "normal", np.array([along[1], -along[0]]) / float(np.linalg.norm(along)))
+
+    def faces(self, ego: Pose) -> bool:
+        """Whether its outside is turned to the ego vehicle."""
+        (nx, ny), (x, y) = self.normal.tolist(), self.start.tolist()
+        return bool(nx * (ego.x - x) + ny * (ego.y - y) > 0.05)
 
 
 def visible_span(camera_base: FloatArray, half_tangent: float) -> tuple[float, float]:
@@ -57,7 +65,7 @@ def visible_span(camera_base: FloatArray, half_tangent: float) -> tuple[float, f
 def draw_wall(target: Target, wall: Wall) -> None:
     """Draw one wall, lit and hazed."""
     camera, ego = target.camera, target.ego
-    if float(wall.normal @ (np.array([ego.x, ego.y]) - wall.start)) <= 0.05:
+    if not wall.faces(ego):
         return
     base = np.array([[*wall.start, 0.0], [*wall.stop, 0.0]])
     camera_base = camera.to_camera(ego.to_local(base))
@@ -97,11 +105,31 @@ def finish(
     received = light.sky * 0.62 + light.bounce * 0.38 + light.sun * lit
     share = 1.0 - math.exp(-depth / light.haze_m)
     lit_picture = cv2.transform(warped, np.column_stack([np.diag(received * (1.0 - share)), light.horizon * share]))
-    size = (window.y1 - window.y0, window.x1 - window.x0)
-    mask = np.zeros(size, np.uint8)
+    mask = np.zeros((window.y1 - window.y0, window.x1 - window.x0), np.uint8)
     cv2.fillConvexPoly(mask, window.pixels(pixels), 255, cv2.LINE_AA, 4)
-    colour = cv2.multiply(lit_picture, cv2.merge([mask, mask, mask]), scale=1.0 / 255.0)
-    composite(target, window, np.asarray(cv2.merge([*cv2.split(colour), mask]), np.uint8), 0)
+    weight = cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR)
+    colour = cv2.multiply(lit_picture, weight, dst=weight, scale=1.0 / 255.0)
+    blend(target.image[window.y0 : window.y1, window.x0 : window.x1], np.asarray(colour, np.uint8), mask)
+    mark(target, window, mask, 0)
+
+
+def hide_party_wall(one: Building, other: Building, gap_m: float) -> None:
+    """Drop an end wall that a neighbour of at least its height and depth covers.
+
+    Args:
+        one: The building whose wall may go.
+        other: The neighbour.
+        gap_m: Gap between the two, metres.
+    """
+    if gap_m > PARTY_GAP_M or other.height < one.height:
+        return
+    middle, local = other.outline.mean(axis=0), other.pose.to_local(one.outline)
+    # Standing farther out than the neighbour leaves a strip of the wall in sight.
+    if local[:, 0].max() > PARTY_STEP_M:
+        return
+    ends = one.walls[1], one.walls[2]
+    hidden = max(ends, key=lambda wall: float(wall.normal @ (middle - wall.start)))
+    one.walls = tuple(wall for wall in one.walls if wall is not hidden)
 
 
 @dataclass(slots=True)
@@ -116,6 +144,17 @@ class Building:
     roof: Mesh | None
     pose: Pose
 
+    @property
+    def anchor(self) -> tuple[float, float, float]:
+        """World x and y, and the distance in metres within which it is seen."""
+        x, y = self.outline.mean(axis=0).tolist()
+        return x, y, float(np.hypot(*(self.outline - self.outline.mean(axis=0)).T).max())
+
+    @property
+    def shadow_reach(self) -> float:
+        """How far its shadow may fall, metres."""
+        return SHADOW_REACH_M
+
     def distance(self, ego: Pose, camera: Camera) -> float | None:
         """Distance of the farthest corner, since whatever stands before the walls is nearer than that."""
         local = ego.to_local(self.outline)
@@ -127,7 +166,7 @@ class Building:
 
     def shadow(self, shadows: ShadowLayer) -> None:
         """The building's cast shadow."""
-        if not shadows.outside(self.pose, 40.0):
+        if not shadows.outside(self.pose, SHADOW_REACH_M):
             shadows.throw(self.outline, 0.0, self.height)
 
     def draw(self, target: Target) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,16 @@ class Camera:
     intrinsics: CameraIntrinsics
     mount_height_m: float
     pitch_down_rad: float
+    vehicle_to_camera: FloatArray = field(init=False, repr=False, compare=False)
+    """Rotation from vehicle axes (forward, right, up) to camera axes (right, down, depth), [3, 3]."""
+    vehicle_origin: FloatArray = field(init=False, repr=False, compare=False)
+    """The vehicle's reference point on the ground in camera axes, [3], metres."""
+
+    def __post_init__(self) -> None:
+        sine, cosine = math.sin(self.pitch_down_rad), math.cos(self.pitch_down_rad)
+        rotation = np.array([[0.0, 1.0, 0.0], [-sine, 0.0, -cosine], [cosine, 0.0, -sine]])
+        object.__setattr__(self, "vehicle_to_camera", rotation)
+        object.__setattr__(self, "vehicle_origin", rotation @ np.array([0.0, 0.0, -self.mount_height_m]))
 
     @classmethod
     def with_field_of_view(
@@ -44,28 +54,22 @@ class Camera:
         return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
 
     @property
-    def vehicle_to_camera(self) -> FloatArray:
-        """Rotation from vehicle axes (forward, right, up) to camera axes (right, down, depth), [3, 3]."""
-        sine, cosine = math.sin(self.pitch_down_rad), math.cos(self.pitch_down_rad)
-        return np.array([[0.0, 1.0, 0.0], [-sine, 0.0, -cosine], [cosine, 0.0, -sine]])
-
-    @property
     def horizon_row(self) -> float:
         """Image row of the horizon, pixels."""
         return self.intrinsics.cy - self.intrinsics.fy * math.tan(self.pitch_down_rad)
 
     def to_camera(self, points: FloatArray) -> FloatArray:
         """Vehicle-frame points [N, 3] in metres to camera-frame points [N, 3] (right, down, depth)."""
-        shifted = points - np.array([0.0, 0.0, self.mount_height_m])
-        return shifted @ self.vehicle_to_camera.T
+        moved: FloatArray = points @ self.vehicle_to_camera.T + self.vehicle_origin
+        return moved
 
     def image_points(self, camera_points: FloatArray) -> FloatArray:
         """Camera-frame points [..., 3] in front of the camera to pixels [..., 2]."""
         k = self.intrinsics
-        depth = np.maximum(camera_points[..., 2], 1e-6)
-        return np.stack(
-            [k.fx * camera_points[..., 0] / depth + k.cx, k.fy * camera_points[..., 1] / depth + k.cy], axis=-1
-        )
+        pixels = camera_points[..., :2] / np.maximum(camera_points[..., 2:], 1e-6)
+        pixels *= (k.fx, k.fy)
+        pixels += (k.cx, k.cy)
+        return pixels
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Vehicle-frame points [N, 3] to pixels [N, 2] and depths [N] (metres, negative behind)."""
@@ -76,8 +80,7 @@ class Camera:
     def ground_to_image(self) -> FloatArray:
         """Homography [3, 3] from (forward, right, 1) on the ground to homogeneous pixels."""
         rotation = self.vehicle_to_camera
-        origin = rotation @ np.array([0.0, 0.0, -self.mount_height_m])
-        return self.matrix @ np.column_stack([rotation[:, 0], rotation[:, 1], origin])
+        return self.matrix @ np.column_stack([rotation[:, 0], rotation[:, 1], self.vehicle_origin])
 
     def row_at_distance(self, forward_m: float) -> float:
         """Image row of the ground straight ahead at a distance."""

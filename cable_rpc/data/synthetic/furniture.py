@@ -34,11 +34,23 @@ class Fixture:
 
     def distance(self, ego: Pose, camera: Camera) -> float | None:
         """Distance of the foot."""
-        forward, right = ego.to_local(np.array([[self.pose.x, self.pose.y]]))[0]
+        cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
+        dx, dy = self.pose.x - ego.x, self.pose.y - ego.y
+        forward, right = cosine * dx + sine * dy, sine * dx - cosine * dy
         half = camera.width / (2.0 * camera.intrinsics.fx)
         if forward < NEAREST_M or abs(right) > half * forward + 1.0 + 0.4 * self.height or forward > 26.0 * self.height:
             return None
-        return float(np.hypot(forward, right))
+        return math.hypot(forward, right)
+
+    @property
+    def anchor(self) -> tuple[float, float, float]:
+        """World x and y, and the distance in metres within which it is seen."""
+        return self.pose.x, self.pose.y, 1.0 + 0.4 * self.height
+
+    @property
+    def shadow_reach(self) -> float:
+        """How far its shadow may fall, metres."""
+        return max(self.width, self.height * 2)
 
     def shadow(self, shadows: ShadowLayer) -> None:
         """The shadow of a thin post."""

@@ -14,10 +14,13 @@ from cable_rpc.data.synthetic.traffic import Crossing
 Float32Array = npt.NDArray[np.float32]
 UInt8Array = npt.NDArray[np.uint8]
 
-NODES = 17
+NODES = 9
 PATCH_CELL_M = 14.0
 KERB_M = 0.16
 FINEST_REPAIR_M = 0.1
+VERGE_FRAY_M = 1.2
+TRACK_STEPS = 1024
+KERB = bgr(158, 156, 150)
 
 
 def band(value: Float32Array, centre: float, half_width: float, texel: float) -> Float32Array:
@@ -29,8 +32,8 @@ def stripes(value: Float32Array, period: float, duty: float, texel: float) -> Fl
     """Area-filtered periodic stripes: 1 inside the first `duty` metres of every period."""
     if texel > period * 0.7:
         return np.full_like(value, duty / period)
-    phase = np.mod(value, period) - duty / 2
-    phase = np.minimum(np.abs(phase), np.abs(phase - period))
+    phase = value - np.float32(period) * np.floor(value * np.float32(1.0 / period)) - np.float32(duty / 2)
+    phase = np.minimum(np.abs(phase), np.abs(phase - np.float32(period)))
     return np.clip((duty / 2 - phase) / texel + 0.5, 0.0, 1.0)
 
 
@@ -43,6 +46,15 @@ def look_up(noise: Float32Array, x: npt.NDArray[np.float64], y: npt.NDArray[np.f
     return sample_wrapped(
         noise, np.ascontiguousarray(np.broadcast_to(columns, shape)), np.ascontiguousarray(np.broadcast_to(rows, shape))
     )
+
+
+def wheel_tracks(street: Street) -> Float32Array:
+    """Brightness change over the driven width, TRACK_STEPS + 1 values from the centre to the edge (0 beyond)."""
+    d = np.arange(TRACK_STEPS + 1) * (street.lanes_each_way * street.lane_width / TRACK_STEPS)
+    lane = np.mod(d, street.lane_width) - street.lane_width / 2
+    change = 0.07 * np.exp(-(((np.abs(lane) - 0.75) / 0.3) ** 2)) - 0.08 * np.exp(-((lane / 0.28) ** 2))
+    change[-1] = 0.0
+    return np.asarray(change, np.float32)
 
 
 class GroundPainter:
@@ -67,6 +79,7 @@ class GroundPainter:
         self.yellow = bgr(214, 164, 44)
         self.white = bgr(222, 222, 216)
         self.wear = float(rng.uniform(0.1, 0.45))
+        self.tracks = wheel_tracks(street)
         self.edge_line = bool(rng.random() < 0.6) or not street.pavement
 
     @property
@@ -82,35 +95,62 @@ class GroundPainter:
         grain, blotch = self.noises(x0, y0, texel, size)
         street = self.street
         half = street.road_half_width
-        colour = np.empty((size, size, 3), np.float32)
-        colour[:] = self.asphalt
-        if float(side.min()) < half + 1.0:
-            colour *= self.asphalt_shade(s, d, texel, grain, blotch)[..., None]
-            self.paint_markings(colour, s, d, texel, blotch)
-        edge = half + KERB_M
-        if street.pavement and float(side.max()) > half - 0.5:
-            self.mix(
-                colour,
-                np.clip((side - half) / texel + 0.5, 0, 1),
-                bgr(158, 156, 150),
-                np.float32(1.0) + np.float32(0.06) * grain,
-            )
-            joint = 1.0 - 0.35 * stripes(s, 1.0, 0.02, texel)
-            colour *= np.where(np.abs(side - half - KERB_M / 2) < KERB_M / 2, joint, 1.0)[..., None]
-            colour *= (1.0 - 0.4 * band(side, half, 0.05, texel))[..., None]
-            slabs = np.ones_like(s)
-            if texel < 0.07:
-                slabs -= 0.28 * np.maximum(stripes(s, 0.9, 0.016, texel), stripes(d, 0.6, 0.016, texel))
-            slabs = slabs * (1.0 + 0.07 * grain + 0.09 * blotch)
-            self.mix(colour, np.clip((side - edge) / texel + 0.5, 0, 1), self.slab, np.asarray(slabs, np.float32))
-        edge += street.pavement
-        if street.verge or street.houses:
-            turf = 1.0 + 0.16 * grain + 0.16 * blotch
+        nearest, farthest = float(side.min()) - texel, float(side.max()) + texel
+        tints: list[npt.NDArray[np.float64]] = []
+        shares: list[Float32Array] = []
+        # From the top layer down; `left` is the share of a texel that shows what lies below.
+        left = np.ones_like(s)
+        edge = half + KERB_M + street.pavement
+        if (street.verge or street.houses) and farthest + VERGE_FRAY_M > edge:
             border = side + 0.12 * blotch + 0.08 * grain
-            inner = half + KERB_M if not street.pavement else edge
-            self.mix(colour, np.clip((border - inner) / texel + 0.5, 0, 1), self.grass, np.asarray(turf, np.float32))
-        light = self.light.ground.astype(np.float32)
-        return np.clip(colour * light, 0, 255).astype(np.uint8)
+            cover = np.clip((border - edge) / texel + 0.5, 0, 1)
+            tints.append(self.grass)
+            shares.append(cover * (1.0 + 0.16 * grain + 0.16 * blotch))
+            left -= cover
+        if street.pavement and farthest > half - 0.1 and left.any():
+            left = self.lay_pavement(tints, shares, left, s, d, texel, grain, blotch)
+        if nearest < half + 1.0 and left.any():
+            white, yellow = self.markings(s, d, texel, blotch)
+            bare = left * (1.0 - white)
+            tints += [self.white, self.yellow, self.asphalt]
+            shares += [left * white, bare * yellow]
+            shares.append(bare * (1.0 - yellow) * self.asphalt_shade(s, d, texel, grain, blotch))
+        elif left.any():
+            tints.append(self.asphalt)
+            shares.append(left)
+        palette = (np.array(tints) * self.light.ground).astype(np.float32)
+        colour = np.stack(shares, dtype=np.float32).reshape(len(shares), -1).T @ palette
+        return np.asarray(cv2.convertScaleAbs(colour), np.uint8).reshape(size, size, 3)
+
+    def lay_pavement(
+        self,
+        tints: list[npt.NDArray[np.float64]],
+        shares: list[Float32Array],
+        left: Float32Array,
+        s: Float32Array,
+        d: Float32Array,
+        texel: float,
+        grain: Float32Array,
+        blotch: Float32Array,
+    ) -> Float32Array:
+        """Add slabs and kerb to the layers; returns what is left of `left` for the carriageway."""
+        side, half = np.abs(d), self.street.road_half_width
+        slabs: Float32Array = 1.0 + 0.07 * grain + 0.09 * blotch
+        if texel < 0.07:
+            slabs *= 1.0 - 0.28 * np.maximum(stripes(s, 0.9, 0.016, texel), stripes(d, 0.6, 0.016, texel))
+        paved: Float32Array = np.clip((side - half - KERB_M) / texel + 0.5, 0, 1)
+        tints.append(self.slab)
+        shares.append(left * paved * slabs)
+        left = left * (1.0 - paved)
+        if float(side.min()) > half + KERB_M + texel:
+            return left
+        on_kerb = np.abs(side - half - KERB_M / 2) < KERB_M / 2
+        joint: Float32Array = 1.0 - 0.35 * on_kerb.astype(np.float32) * stripes(s, 1.0, 0.02, texel)
+        left = left * joint * (1.0 - 0.4 * band(side, half, 0.05, texel))
+        kerb: Float32Array = np.clip((side - half) / texel + 0.5, 0, 1)
+        tints.append(KERB)
+        shares.append(left * kerb * (1.0 + 0.06 * grain))
+        return np.asarray(left * (1.0 - kerb), np.float32)
 
     def road_coordinates(self, x0: float, y0: float, texel: float, size: int) -> tuple[Float32Array, Float32Array]:
         """Road coordinates s, d [size, size] of the texel centres, from a coarse exact grid."""
@@ -143,11 +183,17 @@ class GroundPainter:
         """Brightness factor of the carriageway: grain, stains, wheel tracks, repairs."""
         street = self.street
         shade = 1.0 + 0.10 * grain + 0.07 * blotch
-        lane = np.mod(np.abs(d), street.lane_width) - street.lane_width / 2
-        tracks = np.exp(-(((np.abs(lane) - 0.75) / 0.3) ** 2))
-        driven = np.abs(d) < street.lanes_each_way * street.lane_width
-        shade += np.where(driven, 0.07 * tracks - 0.08 * np.exp(-((lane / 0.28) ** 2)), 0.0)
-        first, last = int(s.min() // PATCH_CELL_M), int(s.max() // PATCH_CELL_M)
+        place = np.abs(d) * np.float32(TRACK_STEPS / (street.lanes_each_way * street.lane_width))
+        shade += self.tracks[np.minimum(place, TRACK_STEPS).astype(np.int16)]
+        s_low, s_high, d_low, d_high = float(s.min()), float(s.max()), float(d.min()), float(d.max())
+
+        def meets(centre_s: float, reach_s: float, centre_d: float, reach_d: float) -> bool:
+            return (
+                s_low - texel - reach_s < centre_s < s_high + texel + reach_s
+                and d_low - texel - reach_d < centre_d < d_high + texel + reach_d
+            )
+
+        first, last = int(s_low // PATCH_CELL_M), int(s_high // PATCH_CELL_M)
         if texel < FINEST_REPAIR_M:
             for cell in range(first, last + 1):
                 rng = np.random.default_rng([self.patch_seed, cell + 1000])
@@ -155,24 +201,29 @@ class GroundPainter:
                     centre_s, centre_d = (cell + rng.random()) * PATCH_CELL_M, rng.uniform(-7, 7)
                     size_s, size_d = rng.uniform(0.5, 3.5), rng.uniform(0.25, 1.3)
                     tone = rng.uniform(-0.22, 0.12)
+                    if not meets(centre_s, size_s, centre_d, size_d):
+                        continue
                     inside = band(s, centre_s, size_s, texel) * band(d, centre_d, size_d, texel)
                     rim = inside - band(s, centre_s, size_s - 0.04, texel) * band(d, centre_d, size_d - 0.04, texel)
                     shade += tone * inside - 0.16 * rim
                 if rng.random() < 0.4:
                     hole_s, hole_d = (cell + rng.random()) * PATCH_CELL_M, rng.uniform(-4, 4)
-                    radius = np.hypot(s - hole_s, d - hole_d)
-                    shade += 0.12 * np.clip((0.34 - radius) / texel + 0.5, 0, 1)
-                    shade -= 0.3 * np.clip((0.05 - np.abs(radius - 0.34)) / texel + 0.5, 0, 1)
+                    if meets(hole_s, 0.5, hole_d, 0.5):
+                        radius = np.hypot(s - hole_s, d - hole_d)
+                        shade += 0.12 * np.clip((0.34 - radius) / texel + 0.5, 0, 1)
+                        shade -= 0.3 * np.clip((0.05 - np.abs(radius - 0.34)) / texel + 0.5, 0, 1)
                 crack_s, crack_d = (cell + rng.random()) * PATCH_CELL_M, rng.uniform(-5, 5)
+                if not meets(crack_s, 1.5, crack_d, 2.0):
+                    continue
                 path = np.abs(s - crack_s + 0.5 * np.sin(d * 2.1 + cell) + 0.15 * blotch)
                 crack = np.clip((0.012 - path) / texel + 0.5, 0, 1) * (np.abs(d - crack_d) < 2.0)
                 shade -= 0.25 * crack
         return np.maximum(shade, 0.2).astype(np.float32)
 
-    def paint_markings(
-        self, colour: Float32Array, s: Float32Array, d: Float32Array, texel: float, blotch: Float32Array
-    ) -> None:
-        """Lane lines, edge lines, parking boxes, zebra crossings and stop lines."""
+    def markings(
+        self, s: Float32Array, d: Float32Array, texel: float, blotch: Float32Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """White and yellow shares of lane lines, edge lines, parking boxes, zebra crossings and stop lines."""
         street = self.street
         edge = street.lanes_each_way * street.lane_width
         white = np.zeros_like(s)
@@ -209,18 +260,8 @@ class GroundPainter:
                     np.maximum(white, line, out=white)
         paint = 1.0 - self.wear * np.clip(0.7 + 0.7 * blotch, 0, 1)
         on_road = side < street.road_half_width
-        for mask, tint in ((yellow, self.yellow), (white, self.white)):
-            share = (mask * paint * on_road)[..., None]
-            colour += share * (tint.astype(np.float32) - colour)
-
-    def mix(
-        self, colour: Float32Array, share: Float32Array, tint: npt.NDArray[np.float64], shade: Float32Array
-    ) -> None:
-        """Blend a shaded tint into the tile in place."""
-        if share.max() <= 0.0:
-            return
-        target = shade[..., None] * tint.astype(np.float32)
-        colour += share[..., None] * (target - colour)
+        paint *= on_road
+        return np.asarray(white * paint, np.float32), np.asarray(yellow * paint, np.float32)
 
 
 def extend(field: npt.NDArray[np.float64], margin: int) -> npt.NDArray[np.float64]:

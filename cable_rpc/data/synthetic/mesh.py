@@ -19,11 +19,15 @@ Colour = FloatArray
 class Mesh:
     """Convex planar faces with material and drawing order."""
 
-    vertices: FloatArray
-    faces: tuple[IntArray, ...]
+    corners: FloatArray
+    """[3, V], metres; every face has its own."""
+    spans: tuple[tuple[int, int], ...]
+    """First vertex of every face and the one after its last."""
     normals: FloatArray
     """[F, 3], outward."""
     centres: FloatArray
+    offsets: FloatArray
+    """[F], distance of the face's plane from the origin along its normal, metres."""
     colours: FloatArray
     """[F, 3], BGR albedo times 255."""
     gloss: FloatArray
@@ -35,11 +39,7 @@ class Mesh:
     parts: IntArray
     part_centres: FloatArray
     sizes: FloatArray
-    """[F], shorter extent in metres."""
-
-    def face(self, index: int) -> IntArray:
-        """Vertex indices of one face."""
-        return self.faces[index]
+    """[F], shorter extent in metres; infinite on layer 0, which is never left out."""
 
 
 @dataclass(slots=True)
@@ -47,7 +47,7 @@ class MeshBuilder:
     """Collects faces; every `add` takes the current part."""
 
     vertices: list[FloatArray] = field(default_factory=list)
-    faces: list[IntArray] = field(default_factory=list)
+    spans: list[tuple[int, int]] = field(default_factory=list)
     outward: list[tuple[FloatArray | None, FloatArray]] = field(default_factory=list)
     materials: list[tuple[Colour, float, float, int, int]] = field(default_factory=list)
     count: int = 0
@@ -67,7 +67,7 @@ class MeshBuilder:
         """Add one face; without a normal it faces away from the builder's centre."""
         corners = np.asarray(polygon, dtype=np.float64)
         self.vertices.append(corners)
-        self.faces.append(np.arange(self.count, self.count + len(corners)))
+        self.spans.append((self.count, self.count + len(corners)))
         self.count += len(corners)
         self.outward.append((normal, self.centre))
         self.materials.append((colour, gloss, glow, layer, self.part))
@@ -153,17 +153,18 @@ class MeshBuilder:
             ]
         )
         return Mesh(
-            np.vstack(self.vertices),
-            tuple(self.faces),
+            np.ascontiguousarray(np.vstack(self.vertices).T),
+            tuple(self.spans),
             normals,
             centres,
+            (normals * centres).sum(axis=1),
             np.array(colours),
             np.array(gloss),
             np.array(glow),
             np.array(layers, dtype=np.int64),
             part_of,
             part_centres,
-            np.sort(np.ptp(padded, axis=1), axis=1)[:, 1],
+            np.where(np.array(layers) == 0, np.inf, np.sort(np.ptp(padded, axis=1), axis=1)[:, 1]),
         )
 
 

@@ -243,7 +243,7 @@ def draw_limbs(target: Target, limbs: list[Limb], pose: Pose, ident: int) -> flo
         [(pixels - reach[:, None, None]).reshape(-1, 2), (pixels + reach[:, None, None]).reshape(-1, 2)]
     )
     extent = float((corners.max(axis=0) - corners.min(axis=0)).max())
-    scale = 6 if extent < 40 else 4 if extent < 110 else 2
+    scale = 4 if extent < 70 else 3 if extent < 110 else 2
     window = window_around(target, corners, scale)
     area = 0.0
     inside = inside_image(target.camera, corners)

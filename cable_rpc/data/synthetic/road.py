@@ -74,6 +74,7 @@ class Road:
         half = (self.heading[1:] + self.heading[:-1]) / 2.0
         self.x = np.concatenate([[0.0], np.cumsum(np.cos(half)) * STEP_M])
         self.y = np.concatenate([[0.0], np.cumsum(np.sin(half)) * STEP_M])
+        self.table = np.column_stack([self.x, self.y, self.heading, self.curvature])
 
     def curvature_at(self, s: float) -> float:
         """Curvature in 1/m, positive to the left."""
@@ -93,16 +94,20 @@ class Road:
         """World points [N, 2] to road coordinates s [N] and d [N], by the nearest centreline point."""
         centre = points.mean(axis=0)
         reach = float(np.abs(points - centre).max()) * 1.5 + 40.0
-        gap = np.hypot(self.x - centre[0], self.y - centre[1])
+        gap = np.sqrt((self.x - centre[0]) ** 2 + (self.y - centre[1]) ** 2)
         near = np.flatnonzero(gap < max(reach, float(gap.min()) + reach))[::4]
         squared = (points[:, :1] - self.x[near]) ** 2 + (points[:, 1:] - self.y[near]) ** 2
         s = self.arc[near[np.argmin(squared, axis=1)]]
         d = np.zeros_like(s)
         for _ in range(3):
-            heading = np.interp(s, self.arc, self.heading)
-            dx, dy = points[:, 0] - np.interp(s, self.arc, self.x), points[:, 1] - np.interp(s, self.arc, self.y)
-            d = np.sin(heading) * dx - np.cos(heading) * dy
-            along = np.cos(heading) * dx + np.sin(heading) * dy
-            bend = np.maximum(1.0 + np.interp(s, self.arc, self.curvature) * d, 0.4)
+            index = np.clip((s - START_M) / STEP_M, 0.0, len(self.arc) - 1.001)
+            low = index.astype(np.int64)
+            share = index - low
+            x, y, heading, curvature = self.table[low].T * (1.0 - share) + self.table[low + 1].T * share
+            sine, cosine = np.sin(heading), np.cos(heading)
+            dx, dy = points[:, 0] - x, points[:, 1] - y
+            d = sine * dx - cosine * dy
+            along = cosine * dx + sine * dy
+            bend = np.maximum(1.0 + curvature * d, 0.4)
             s = s + np.clip(along / bend, -3.0, 3.0)
         return s, d

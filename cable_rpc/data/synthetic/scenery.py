@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from cable_rpc.data.synthetic.buildings import build_building
+from cable_rpc.data.synthetic.buildings import Building, build_building, hide_party_wall
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.facades import Texture, facade, plain_wall
 from cable_rpc.data.synthetic.furniture import Fixture, bin_or_box, bollard, lamp_post, sign
@@ -31,6 +31,16 @@ class Prop(Protocol):
     """A still object."""
 
     s: float
+
+    @property
+    def anchor(self) -> tuple[float, float, float]:
+        """World x and y, and the distance in metres within which it is seen."""
+        ...
+
+    @property
+    def shadow_reach(self) -> float:
+        """How far its shadow may fall, metres."""
+        ...
 
     def distance(self, ego: Pose, camera: Camera) -> float | None:
         """Sorting distance from the ego vehicle, None where it can't be seen."""
@@ -76,6 +86,8 @@ def add_buildings(rng: np.random.Generator, props: list[Prop], road: Road, stree
     line = street.road_half_width + 0.16 + street.pavement + street.verge + street.building_gap
     for side in (1, -1):
         s = BEGIN_M + float(rng.uniform(0.0, 8.0))
+        before: Building | None = None
+        gap = math.inf
         while s < reach_m + 90.0:
             choice = int(rng.integers(FACADES))
             front, end = fronts[choice], ends[choice]
@@ -86,13 +98,18 @@ def add_buildings(rng: np.random.Generator, props: list[Prop], road: Road, stree
             # The front looks back at the road: to the left of travel for a building on the right.
             pose = road.pose(middle, side * (line + set_back), side * math.pi / 2)
             roof = ROOFS[int(rng.integers(len(ROOFS)))] if house else None
-            props.append(build_building(middle, pose, front.width_m, depth, front, end, backs[0], roof))
+            building = build_building(middle, pose, front.width_m, depth, front, end, backs[0], roof)
+            props.append(building)
+            if before is not None and not house:
+                hide_party_wall(building, before, gap)
+                hide_party_wall(before, building, gap)
             if street.name == "country":
-                s += front.width_m + float(rng.uniform(30.0, 120.0))
+                gap = float(rng.uniform(30.0, 120.0))
             elif house:
-                s += front.width_m + float(rng.uniform(3.0, 12.0))
+                gap = float(rng.uniform(3.0, 12.0))
             else:
-                s += front.width_m + (float(rng.uniform(3.0, 9.0)) if rng.random() < 0.15 else 0.05)
+                gap = float(rng.uniform(3.0, 9.0)) if rng.random() < 0.15 else 0.05
+            s, before = s + front.width_m + gap, building
 
 
 def add_plants(

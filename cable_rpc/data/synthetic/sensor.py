@@ -45,7 +45,9 @@ class Sensor:
     def expose(self, image: UInt8Array, index: int) -> UInt8Array:
         """The frame that the sensor delivers, uint8 [H, W, 3] contiguous."""
         if self.blur_sigma > 0:
-            image = np.asarray(cv2.GaussianBlur(image, (0, 0), self.blur_sigma), dtype=np.uint8)
+            # Up to this width the next ring of the kernel weighs less than a grey level.
+            side = 3 if self.blur_sigma <= 0.6 else 0
+            image = np.asarray(cv2.GaussianBlur(image, (side, side), self.blur_sigma), dtype=np.uint8)
         image = np.asarray(cv2.multiply(image, self.shade, scale=1.0 / 255.0), dtype=np.uint8)
         if self.noise <= 0:
             return np.ascontiguousarray(image)

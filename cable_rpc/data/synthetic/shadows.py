@@ -29,27 +29,38 @@ class ShadowLayer:
         height, width = -(-(camera.height - self.top) // SHRINK), -(-camera.width // SHRINK)
         self.contact: UInt8Array = np.zeros((height, width), np.uint8)
         self.cast: UInt8Array = np.zeros((height, width), np.uint8)
+        ego = target.ego
+        cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
+        to_vehicle = np.array(
+            [
+                [cosine, sine, -cosine * ego.x - sine * ego.y],
+                [sine, -cosine, -sine * ego.x + cosine * ego.y],
+                [0, 0, 1],
+            ]
+        )
+        to_mask = np.array(
+            [[SUBPIXEL / SHRINK, 0, 0], [0, SUBPIXEL / SHRINK, -self.top * SUBPIXEL / SHRINK], [0, 0, 1]]
+        )
+        homography = to_mask @ camera.ground_to_image @ to_vehicle
+        self.linear, self.offset = homography[:, :2].T.copy(), homography[:, 2]
 
     def fill(self, mask: UInt8Array, outline: FloatArray, strength: int) -> None:
-        """Darken a convex ground polygon [N, 2] given in vehicle axes."""
-        flat = np.column_stack([outline, np.zeros(len(outline))])
-        points = self.target.camera.to_camera(flat)
+        """Darken a convex ground polygon [N, 2] given in world metres."""
+        points = outline @ self.linear + self.offset
+        # The third homogeneous coordinate is the depth in metres.
         if points[:, 2].min() < NEAR_PLANE_M:
             points = clip_near(points)
             if len(points) < 3:
                 return
-        pixels = self.target.camera.image_points(points)
-        fixed = ((pixels - np.array([0.0, self.top])) / SHRINK * SUBPIXEL).clip(-60000, 120000)
-        cv2.fillConvexPoly(mask, fixed.astype(np.int32), strength, cv2.LINE_8, SUBPIXEL_BITS)
+        fixed = np.clip(points[:, :2] / points[:, 2:], -60000, 120000).astype(np.int32)
+        cv2.fillConvexPoly(mask, fixed, strength, cv2.LINE_8, SUBPIXEL_BITS)
 
     def add_box(self, pose: Pose, length: float, width: float, height: float) -> None:
         """The contact shadow under an object and the shadow its box throws from the sun."""
         if self.outside(pose, max(length, height * 2)):
             return
         for grow, strength in ((0.22, 90), (0.05, 190)):
-            self.fill(
-                self.contact, self.target.ego.to_local(pose.to_world(rectangle(length + grow, width + grow))), strength
-            )
+            self.fill(self.contact, pose.to_world(rectangle(length + grow, width + grow)), strength)
         self.throw(pose.to_world(rectangle(length * 0.94, width * 0.94)), 0.1, height * 0.94)
 
     def throw(self, base: FloatArray, low: float, high: float) -> None:
@@ -61,7 +72,7 @@ class ShadowLayer:
         slope = -light.sun_direction[:2] / rise
         outline = np.vstack([base + slope * low, base + slope * high])
         hull = cv2.convexHull(outline.astype(np.float32))[:, 0].astype(np.float64)
-        self.fill(self.cast, self.target.ego.to_local(hull), 255)
+        self.fill(self.cast, hull, 255)
 
     def outside(self, pose: Pose, reach: float) -> bool:
         """Whether nothing near the pose can reach the image."""
@@ -77,9 +88,11 @@ class ShadowLayer:
         size = (image.shape[1], image.shape[0])
         contact = cv2.GaussianBlur(self.contact, (0, 0), 2.6 * image.shape[1] / 960.0 * 2 / SHRINK)
         cast = cv2.GaussianBlur(self.cast, (0, 0), 1.3 * image.shape[1] / 960.0 * 2 / SHRINK)
-        light = 255.0 * (1.0 - cast * (self.target.light.shadow / 255.0)) * (1.0 - contact * (0.85 / 255.0))
-        kept = cv2.resize(light.astype(np.uint8), size, interpolation=cv2.INTER_LINEAR)
-        image[:] = cv2.multiply(image, cv2.merge([kept, kept, kept]), scale=1.0 / 255.0)
+        light = (255.0 - cast * np.float32(self.target.light.shadow)) * (1.0 - contact * np.float32(0.85 / 255.0))
+        kept = cv2.cvtColor(
+            cv2.resize(light.astype(np.uint8), size, interpolation=cv2.INTER_LINEAR), cv2.COLOR_GRAY2BGR
+        )
+        cv2.multiply(image, kept, dst=image, scale=1.0 / 255.0)
 
 
 def rectangle(length: float, width: float) -> FloatArray:

@@ -52,10 +52,11 @@ def paint_panorama(rng: np.random.Generator, light: Light, skyline: float) -> UI
     """The full circle of sky [rows, PANORAMA_WIDTH, 3]; columns run clockwise."""
     per_radian = PANORAMA_WIDTH / (2.0 * math.pi)
     rows = math.ceil((HIGHEST_RAD - LOWEST_RAD) * per_radian)
-    elevation = (HIGHEST_RAD - np.arange(rows) / per_radian)[:, None]
-    azimuth = (-np.arange(PANORAMA_WIDTH) / per_radian)[None, :]
+    elevation = (HIGHEST_RAD - np.arange(rows) / per_radian).astype(np.float32)[:, None]
+    azimuth = (-np.arange(PANORAMA_WIDTH) / per_radian).astype(np.float32)[None, :]
+    horizon, zenith = light.horizon.astype(np.float32), light.zenith.astype(np.float32)
     up = np.clip(np.sin(elevation), 0.0, 1.0)
-    colour = light.horizon + (light.zenith - light.horizon) * (up**0.6)[..., None]
+    colour = horizon + (zenith - horizon) * (up**0.6)[..., None]
     colour = np.broadcast_to(colour, (rows, PANORAMA_WIDTH, 3)).astype(np.float32)
     noise = tileable_noise(rng, 512, 1.45)
     stretch = 62.0 / (up + 0.14)
@@ -70,6 +71,7 @@ def paint_panorama(rng: np.random.Generator, light: Light, skyline: float) -> UI
     dark = light.zenith * 0.45 + light.horizon * 0.45
     if light.name == "overcast":
         lit, dark = bgr(206, 210, 216), bgr(150, 156, 166)
+    lit, dark = lit.astype(np.float32), dark.astype(np.float32)
     cloud = lit + (dark - lit) * depth[..., None]
     share = (cover * np.clip(up * 9.0, 0.0, 0.9))[..., None]
     colour = colour + share * (cloud - colour)
@@ -77,7 +79,7 @@ def paint_panorama(rng: np.random.Generator, light: Light, skyline: float) -> UI
     sun_elevation = math.asin(float(light.sun_direction[2]))
     away = np.hypot(np.angle(np.exp(1j * (azimuth - sun_azimuth))) * math.cos(sun_elevation), elevation - sun_elevation)
     glow = 0.5 * np.exp(-((away / 0.35) ** 1.3)) * (0.0 if light.name == "overcast" else 1.0)
-    colour += glow[..., None] * (np.array([225.0, 245.0, 255.0]) - colour)
+    colour += glow[..., None] * (np.array([225.0, 245.0, 255.0], np.float32) - colour)
     add_far_silhouettes(rng, colour, elevation[:, 0], light, skyline)
     return np.clip(colour, 0, 255).astype(np.uint8)
 
@@ -85,7 +87,7 @@ def paint_panorama(rng: np.random.Generator, light: Light, skyline: float) -> UI
 def add_far_silhouettes(
     rng: np.random.Generator,
     colour: npt.NDArray[np.floating],
-    elevation: npt.NDArray[np.float64],
+    elevation: Float32Array,
     light: Light,
     skyline: float,
 ) -> None:
@@ -103,5 +105,6 @@ def add_far_silhouettes(
         low = int(np.searchsorted(-elevation, -float(ridge.max()) - 0.01))
         inside = np.clip((ridge[None, :] - elevation[low:, None]) * PANORAMA_WIDTH / 6.28 + 0.5, 0.0, 1.0)
         rough = 1.0 + 0.06 * rng.standard_normal((len(elevation) - low, PANORAMA_WIDTH))
-        target = tint * cv2.GaussianBlur(rough, (0, 0), 1.2)[..., None]
-        colour[low:] += inside[..., None] * (target - colour[low:])
+        rough = np.asarray(cv2.GaussianBlur(rough.astype(np.float32), (0, 0), 1.2))
+        target = tint.astype(np.float32) * rough[..., None]
+        colour[low:] += inside.astype(np.float32)[..., None] * (target - colour[low:])

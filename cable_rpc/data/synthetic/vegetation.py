@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.synthetic.camera import Camera
-from cable_rpc.data.synthetic.raster import Target, composite, window_around
+from cable_rpc.data.synthetic.raster import Target, Window, composite
 from cable_rpc.data.synthetic.road import Pose
 from cable_rpc.data.synthetic.scenario import Light, bgr
 from cable_rpc.data.synthetic.shadows import ShadowLayer
@@ -20,6 +20,9 @@ UInt8Array = npt.NDArray[np.uint8]
 
 SPRITE_HEIGHT = 448
 NEAREST_M = 1.5
+SHADOW_REACH_M = 12.0
+LEAST_PIXELS = 2.5
+CIRCLE = np.array([[math.cos(math.pi * turn / 6), math.sin(math.pi * turn / 6)] for turn in range(12)])
 
 LEAVES = (bgr(70, 100, 40), bgr(58, 92, 44), bgr(88, 104, 44), bgr(62, 84, 34), bgr(112, 104, 44), bgr(52, 84, 52))
 BARK = bgr(86, 70, 56)
@@ -132,55 +135,73 @@ class Plant:
     crown: float
     """Radius of the shadow in metres."""
 
+    @property
+    def anchor(self) -> tuple[float, float, float]:
+        """World x and y, and the distance in metres within which it is seen."""
+        return self.x, self.y, self.height
+
+    @property
+    def shadow_reach(self) -> float:
+        """How far its shadow may fall, metres."""
+        return SHADOW_REACH_M
+
+    def local(self, ego: Pose) -> tuple[float, float]:
+        """Forward and right metres from the ego vehicle."""
+        cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
+        dx, dy = self.x - ego.x, self.y - ego.y
+        return cosine * dx + sine * dy, sine * dx - cosine * dy
+
     def distance(self, ego: Pose, camera: Camera) -> float | None:
         """Distance of the foot."""
-        forward, right = ego.to_local(np.array([[self.x, self.y]]))[0]
+        forward, right = self.local(ego)
         half = camera.width / (2.0 * camera.intrinsics.fx)
         if forward < NEAREST_M or abs(right) > half * forward + self.height:
             return None
-        return float(np.hypot(forward, right))
+        return math.hypot(forward, right)
 
     def shadow(self, shadows: ShadowLayer) -> None:
         """The crown's shadow and a dark foot."""
         pose = Pose(self.x, self.y, 0.0)
-        if shadows.outside(pose, 12.0):
+        if shadows.outside(pose, SHADOW_REACH_M):
             return
-        angle = np.linspace(0, 2 * math.pi, 13)[:-1]
-        ring = np.column_stack([self.x + self.crown * np.cos(angle), self.y + self.crown * np.sin(angle)])
-        shadows.throw(ring, self.height * 0.4, self.height * 0.8)
-        small = np.array([self.x, self.y]) + (ring - np.array([self.x, self.y])) * 0.3
-        shadows.fill(shadows.contact, shadows.target.ego.to_local(small), 110)
+        place = (self.x, self.y)
+        shadows.throw(CIRCLE * self.crown + place, self.height * 0.4, self.height * 0.8)
+        shadows.fill(shadows.contact, CIRCLE * (self.crown * 0.3) + place, 110)
 
     def draw(self, target: Target) -> None:
         """Draw it as an upright picture that faces the camera."""
-        points = target.ego.to_local(np.array([[self.x, self.y, 0.0], [self.x, self.y, self.height]]))
-        pixels, depth = target.camera.project(points)
-        if depth.min() < NEAREST_M:
+        forward, right = self.local(target.ego)
+        camera, k = target.camera, target.camera.intrinsics
+        sine, cosine = math.sin(camera.pitch_down_rad), math.cos(camera.pitch_down_rad)
+        foot, top = camera.mount_height_m, camera.mount_height_m - self.height
+        near, far = cosine * forward + sine * top, cosine * forward + sine * foot
+        if min(near, far) < NEAREST_M:
+            return
+        foot_x = k.fx * right / far + k.cx
+        foot_y = k.fy * (cosine * foot - sine * forward) / far + k.cy
+        top_y = k.fy * (cosine * top - sine * forward) / near + k.cy
+        tall = foot_y - top_y
+        if tall < LEAST_PIXELS:
             return
         full = self.sprite.levels[0]
-        tall = float(pixels[0, 1] - pixels[1, 1])
-        level = int(
-            np.clip(round(math.log2(max(full.shape[0] / max(tall, 1.0), 1.0)) - 0.2), 0, len(self.sprite.levels) - 1)
-        )
+        level = max(0, min(round(math.log2(max(full.shape[0] / tall, 1.0)) - 0.2), len(self.sprite.levels) - 1))
         picture = self.sprite.levels[level]
         height, width = picture.shape[:2]
         scale = tall / height
         half = width * scale / 2
-        corners = np.array([[pixels[1, 0] - half, pixels[1, 1]], [pixels[0, 0] + half, pixels[0, 1]]])
-        window = window_around(target, corners, 1)
-        if window is None:
+        x0, y0 = max(0, math.floor(foot_x - half - 1.5)), max(0, math.floor(top_y - 1.5))
+        x1 = min(camera.width, math.ceil(foot_x + half + 1.5) + 1)
+        y1 = min(camera.height, math.ceil(foot_y + 1.5) + 1)
+        if x0 >= x1 or y0 >= y1:
             return
-        matrix = np.array(
-            [
-                [scale, 0.0, pixels[0, 0] - half + (scale - 1) / 2 - window.x0],
-                [0.0, scale, pixels[1, 1] + (scale - 1) / 2 - window.y0],
-            ]
-        )
+        window = Window(x0, y0, x1, y1, 1)
+        shift = (scale - 1) / 2
+        matrix = np.array([[scale, 0.0, foot_x - half + shift - x0], [0.0, scale, top_y + shift - y0]])
         size = (window.x1 - window.x0, window.y1 - window.y0)
         layer = cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_LINEAR)
-        share = 1.0 - math.exp(-float(depth[0]) / target.light.haze_m)
+        share = 1.0 - math.exp(-far / target.light.haze_m)
         if share > 0.02:
             veil = np.diag([1.0 - share, 1.0 - share, 1.0 - share, 1.0])
-            veil[:3, 3] = share * target.light.horizon / 255.0
+            veil[:3, 3] = target.light.horizon * (share / 255.0)
             layer = cv2.transform(layer, veil)
         composite(target, window, np.asarray(layer, np.uint8), 0)

@@ -17,7 +17,7 @@ from cable_rpc.data.synthetic.road import Pose, Road
 from cable_rpc.data.synthetic.scenario import draw_scenario
 from cable_rpc.data.synthetic.scenery import Prop, build_scenery
 from cable_rpc.data.synthetic.sensor import Sensor
-from cable_rpc.data.synthetic.shadows import ShadowLayer
+from cable_rpc.data.synthetic.shadows import SHADOWS_M, ShadowLayer
 from cable_rpc.data.synthetic.sky import Sky
 from cable_rpc.data.synthetic.traffic import simulate
 from cable_rpc.types import EgoMotion, GroundTruth, Image
@@ -48,7 +48,7 @@ class World:
         self.props: list[Prop] = build_scenery(
             rng, self.road, self.street, self.light, self.traffic.crossings, self.reach_m
         )
-        self.prop_s = np.array([prop.s for prop in self.props])
+        self.anchors = np.array([[*prop.anchor, prop.shadow_reach, prop.s] for prop in self.props]).reshape(-1, 5).T
         self.sensor = Sensor(seed, camera.width, camera.height, noise, blur, vignette)
 
     def ego(self, time_s: float) -> tuple[Pose, EgoMotion]:
@@ -65,6 +65,20 @@ class World:
         half = self.camera.width / (2.0 * self.camera.intrinsics.fx)
         return bool(forward > -reach_m and abs(right) < half * max(forward, 0.0) + 1.5 * reach_m)
 
+    def nearby(self, ego: Pose, ego_s: float) -> tuple[list[int], list[int]]:
+        """Indices of the props that may be seen and of those whose shadow may be seen."""
+        x, y, reach, shadow_reach, s = self.anchors
+        cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
+        forward = cosine * (x - ego.x) + sine * (y - ego.y)
+        aside = np.abs(sine * (x - ego.x) - cosine * (y - ego.y))
+        along = (s > ego_s - 40.0) & (s < ego_s + VIEW_AHEAD_M + 40.0)
+        half = self.camera.width / (2.0 * self.camera.intrinsics.fx) * 1.05
+        wedge = half * np.maximum(forward, 0.0)
+        seen = along & (forward > -reach) & (aside < wedge + 2.0 * reach)
+        margin = 2.0 * shadow_reach + reach
+        shadowing = along & (forward > -margin) & (forward < SHADOWS_M + margin) & (aside < wedge + margin)
+        return np.flatnonzero(seen).tolist(), np.flatnonzero(shadowing).tolist()
+
     def render(self, time_s: float, index: int) -> tuple[Image, GroundTruth]:
         """The camera frame and its truth at a time; `index` chooses the sensor noise."""
         camera, pose = self.camera, self.ego(time_s)[0]
@@ -73,15 +87,15 @@ class World:
         self.sky.render(image, pose.heading)
         self.ground.render(image, pose)
         ego_s = float(self.traffic.at(time_s)[0][0])
-        near = np.flatnonzero((self.prop_s > ego_s - 40.0) & (self.prop_s < ego_s + VIEW_AHEAD_M + 40.0))
-        props = [self.props[int(index)] for index in near]
         shadows = ShadowLayer(target)
         queue: list[tuple[float, int, Prop | None, int, Pose]] = []
-        for place, prop in enumerate(props):
-            distance = prop.distance(pose, camera)
+        seen, shadowing = self.nearby(pose, ego_s)
+        for place in seen:
+            distance = self.props[place].distance(pose, camera)
             if distance is not None:
-                queue.append((distance, place, prop, 0, pose))
-            prop.shadow(shadows)
+                queue.append((distance, place, self.props[place], 0, pose))
+        for place in shadowing:
+            self.props[place].shadow(shadows)
         for number, actor in enumerate(self.actors):
             placement = actor.place(time_s)
             if not ego_s - VIEW_BEHIND_M < placement.s < ego_s + ACTORS_AHEAD_M:
@@ -100,4 +114,4 @@ class World:
             else:
                 actor = self.actors[ident - 1]
                 drawn.append(Drawn(actor, ident, actor.draw(target, where, time_s, ident)))
-        return self.sensor.expose(image, index), collect_truth(target.ids, drawn)
+        return self.sensor.expose(image, index), collect_truth(target.ids, drawn, target.windows)
