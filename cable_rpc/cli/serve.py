@@ -44,6 +44,10 @@ def serve(
             f"--listen {listen} is reachable from other machines and this server speaks plain text; "
             "add --insecure if the network is trusted (a VPN or a lab), or listen on 127.0.0.1"
         )
+    try:
+        import onnxruntime  # noqa: F401 - asked for here so that its absence gets a sentence
+    except ModuleNotFoundError as error:
+        raise ConfigurationError("serving needs the cloud extra: pip install 'cable-rpc[cloud]'") from error
     from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segmenter
     from cable_rpc.cloud.model_runner import ThreadModelRunner
     from cable_rpc.cloud.perception import PerceptionModels

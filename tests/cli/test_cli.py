@@ -61,6 +61,13 @@ def test_misuse_is_one_line_and_exit_code_2(arguments: list[str], said: str) -> 
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+def test_server_without_its_extra_says_what_to_install() -> None:
+    program = "import sys; sys.modules['onnxruntime'] = None; from cable_rpc.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", program, "serve"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.strip() == "cable-rpc: serving needs the cloud extra: pip install 'cable-rpc[cloud]'"
+
+
 def test_nobody_at_the_target(unused_tcp_port: int, tmp_path: Path) -> None:
     done = cable_rpc(
         "stream", "--source", "synthetic:1", "--frames", "2", "--target", f"127.0.0.1:{unused_tcp_port}",
