@@ -19,7 +19,7 @@ from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
 from cable_rpc.study.summary_table import render_summary
 from cable_rpc.types import CameraIntrinsics
 
-console = Console()
+console = Console(width=None if sys.stdout.isatty() else 100)
 
 
 def stream(
