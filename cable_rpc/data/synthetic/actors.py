@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
+from cable_rpc.data.synthetic.camera import NEAR_PLANE_M
 from cable_rpc.data.synthetic.heavy import (
     BUS_LENGTH,
     BUS_PAINTS,
@@ -20,14 +22,17 @@ from cable_rpc.data.synthetic.heavy import (
     build_truck,
 )
 from cable_rpc.data.synthetic.mesh import Mesh
-from cable_rpc.data.synthetic.people import Look, cycling_limbs, draw_limbs, walking_limbs
-from cable_rpc.data.synthetic.raster import Target, draw_mesh
+from cable_rpc.data.synthetic.occlusion import Occlusion, square
+from cable_rpc.data.synthetic.people import Look, cycling_limbs, draw_limbs, draw_walker
+from cable_rpc.data.synthetic.raster import Target, draw_mesh, object_axes
 from cable_rpc.data.synthetic.road import Pose, Road
+from cable_rpc.data.synthetic.shadows import rectangle
 from cable_rpc.data.synthetic.traffic import Traffic
 from cable_rpc.data.synthetic.vehicles import CAR_SHAPES, PAINTS, build_car
 
 FloatArray = npt.NDArray[np.float64]
 
+HIDES_M = 70.0
 PERSON, BICYCLE, CAR, BUS, TRUCK = 0, 1, 2, 5, 7
 VEHICLE_KINDS = ("hatch", "sedan", "estate", "suv", "van", "panel_van", "truck", "bus")
 KIND_SHARES = np.array([0.22, 0.17, 0.13, 0.16, 0.07, 0.07, 0.11, 0.07])
@@ -58,9 +63,38 @@ class Actor(Protocol):
         """Where it is at a time."""
         ...
 
+    def space(self, pose: Pose) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it at a pose."""
+        ...
+
+    def cover(self, target: Target, occlusion: Occlusion, pose: Pose) -> None:
+        """Add what it covers of the image."""
+        ...
+
     def draw(self, target: Target, pose: Pose, time_s: float, ident: int) -> float:
         """Draw it; returns its whole projected area in pixels."""
         ...
+
+
+def box_corners(x: tuple[float, float], half: float, z: tuple[float, float]) -> FloatArray:
+    """Corners [3, 8] of a box."""
+    return np.array([[a, b, c] for a in x for b in (-half, half) for c in z]).T
+
+
+def solid_blocks(name: str) -> tuple[FloatArray, ...]:
+    """Convex bodies [3, N] that lie inside the drawn vehicle and hide what is behind them."""
+    if name == "truck":
+        rear, front = -TRUCK_LENGTH / 2, TRUCK_LENGTH / 2
+        return (box_corners((rear + 0.15, front - 2.35), TRUCK_WIDTH / 2 - 0.2, (1.05, 3.3)),)
+    if name == "bus":
+        return (box_corners((-BUS_LENGTH / 2 + 0.15, BUS_LENGTH / 2 - 0.15), BUS_WIDTH / 2 - 0.2, (0.4, 2.9)),)
+    shape = CAR_SHAPES["van" if name == "panel_van" else name]
+    half, low = shape.width / 2 - 0.2, shape.clearance + 0.15
+    sill = box_corners((shape.rear_base + 0.1, shape.front_base - 0.25), half, (low, shape.belt))
+    roof = box_corners(
+        (shape.rear_top + 0.05, shape.front_top - 0.05), shape.width / 2 * 0.76 - 0.05, (shape.belt, shape.roof - 0.1)
+    )
+    return (np.hstack([sill, roof]),)
 
 
 class VehicleModel:
@@ -74,6 +108,7 @@ class VehicleModel:
         third = PAINTS[int(rng.integers(len(PAINTS)))]
         bus_paint = BUS_PAINTS[int(rng.integers(len(BUS_PAINTS)))]
 
+        self.blocks = solid_blocks(name)
         self.colours = (paint, second, third, bus_paint)
         self.built: dict[bool, Mesh] = {}
         width = {"truck": TRUCK_WIDTH, "bus": BUS_WIDTH}.get(name)
@@ -127,6 +162,24 @@ class Vehicle:
         now, before = self.place(time_s).speed, self.place(max(0.0, time_s - 0.2)).speed
         return now < 0.2 or now < before - 0.12
 
+    def space(self, pose: Pose) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it at a pose."""
+        length, width = self.footprint
+        # Mirrors and bumpers stand out of the footprint.
+        return pose.to_world(rectangle(length + 0.3, width + 0.7)), self.height + 0.2
+
+    def cover(self, target: Target, occlusion: Occlusion, pose: Pose) -> None:
+        """Add the inside of the body to what is covered, unless it is too small to hide anything."""
+        reach = math.hypot(pose.x - target.ego.x, pose.y - target.ego.y)
+        if reach > HIDES_M:
+            return
+        rotation, origin, _ = object_axes(target, pose)
+        for block in self.model.blocks:
+            points = (rotation @ block + origin[:, None]).T
+            if points[:, 2].min() > NEAR_PLANE_M:
+                pixels = target.camera.image_points(points).astype(np.float32)
+                occlusion.cover(cv2.convexHull(pixels)[:, 0].astype(np.float64))
+
     def draw(self, target: Target, pose: Pose, time_s: float, ident: int) -> float:
         """Draw it."""
         return draw_mesh(target, self.model.mesh(self.braking(time_s)), pose, ident)
@@ -154,10 +207,17 @@ class Walker:
         turned = (0.0 if self.direction > 0 else math.pi) if self.speed else self.turned
         return Placement(moved, self.d + weave, turned, self.speed)
 
+    def space(self, pose: Pose) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it at a pose."""
+        return square(pose.x, pose.y, 0.8), self.height + 0.45
+
+    def cover(self, target: Target, occlusion: Occlusion, pose: Pose) -> None:
+        """It is too thin to hide anything."""
+
     def draw(self, target: Target, pose: Pose, time_s: float, ident: int) -> float:
         """Draw it."""
         phase = self.speed * time_s / (0.41 * self.look.height) * math.pi + self.track_id
-        return draw_limbs(target, walking_limbs(self.look, phase, 1.0 if self.speed else 0.12), pose, ident)
+        return draw_walker(target, self.look, phase, 1.0 if self.speed else 0.12, pose, ident)
 
 
 @dataclass(slots=True)
@@ -186,12 +246,19 @@ class Crosser:
         moving = 0.0 < walked < abs(self.stop_d - self.start_d)
         return Placement(self.s, self.start_d + sign * walked, -sign * math.pi / 2, self.speed if moving else 0.0)
 
+    def space(self, pose: Pose) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it at a pose."""
+        return square(pose.x, pose.y, 0.8), self.height + 0.45
+
+    def cover(self, target: Target, occlusion: Occlusion, pose: Pose) -> None:
+        """It is too thin to hide anything."""
+
     def draw(self, target: Target, pose: Pose, time_s: float, ident: int) -> float:
         """Draw it."""
         walked = self.walked(time_s)
         moving = 0.0 < walked < abs(self.stop_d - self.start_d)
         phase = walked / (0.41 * self.look.height) * math.pi
-        return draw_limbs(target, walking_limbs(self.look, phase, 1.0 if moving else 0.1), pose, ident)
+        return draw_walker(target, self.look, phase, 1.0 if moving else 0.1, pose, ident)
 
 
 @dataclass(slots=True)
@@ -212,6 +279,13 @@ class Cyclist:
         """Where it is at a time."""
         s = self.s + self.direction * self.speed * time_s
         return Placement(s, self.d + 0.07 * math.sin(0.5 * s), 0.0 if self.direction > 0 else math.pi, self.speed)
+
+    def space(self, pose: Pose) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it at a pose."""
+        return square(pose.x, pose.y, 1.4), self.height + 0.45
+
+    def cover(self, target: Target, occlusion: Occlusion, pose: Pose) -> None:
+        """It is too thin to hide anything."""
 
     def draw(self, target: Target, pose: Pose, time_s: float, ident: int) -> float:
         """Draw it."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ import numpy.typing as npt
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.facades import TEXELS_PER_M, Texture
 from cable_rpc.data.synthetic.mesh import Mesh, MeshBuilder
+from cable_rpc.data.synthetic.occlusion import Occlusion
 from cable_rpc.data.synthetic.raster import Target, Window, blend, draw_mesh, mark, window_around
 from cable_rpc.data.synthetic.road import Pose
 from cable_rpc.data.synthetic.shadows import ShadowLayer
@@ -33,21 +36,24 @@ class Wall:
     texture: Texture
     normal: FloatArray = field(init=False)
     """Outward unit normal in the ground plane."""
+    plane: tuple[float, float, float] = field(init=False)
+    """The normal and the distance of its line from the origin, metres."""
 
     def __post_init__(self) -> None:
         along = self.stop - self.start
-        object.__setattr__(self, "normal", np.array([along[1], -along[0]]) / float(np.linalg.norm(along)))
+        normal = np.array([along[1], -along[0]]) / float(np.linalg.norm(along))
+        object.__setattr__(self, "normal", normal)
+        object.__setattr__(self, "plane", (float(normal[0]), float(normal[1]), float(normal @ self.start)))
 
     def faces(self, ego: Pose) -> bool:
         """Whether its outside is turned to the ego vehicle."""
-        (nx, ny), (x, y) = self.normal.tolist(), self.start.tolist()
-        return bool(nx * (ego.x - x) + ny * (ego.y - y) > 0.05)
+        nx, ny, offset = self.plane
+        return nx * ego.x + ny * ego.y - offset > 0.05
 
 
-def visible_span(camera_base: FloatArray, half_tangent: float) -> tuple[float, float]:
-    """The part u0..u1 of a base line [2, 3] (camera axes) inside the horizontal field of view."""
+def visible_span(x0: float, z0: float, x1: float, z1: float, half_tangent: float) -> tuple[float, float]:
+    """The part u0..u1 of a base line, right and depth in metres, inside the horizontal field of view."""
     low, high = 0.0, 1.0
-    (x0, _, z0), (x1, _, z1) = camera_base
     for value0, value1 in (
         (z0 - NEAREST_WALL_M, z1 - NEAREST_WALL_M),
         (half_tangent * z0 - x0, half_tangent * z1 - x1),
@@ -62,22 +68,47 @@ def visible_span(camera_base: FloatArray, half_tangent: float) -> tuple[float, f
     return low, high
 
 
-def draw_wall(target: Target, wall: Wall) -> None:
-    """Draw one wall, lit and hazed."""
+@dataclass(frozen=True, slots=True)
+class WallView:
+    """The part of a wall inside the field of view."""
+
+    wall: Wall
+    low: float
+    high: float
+    pixels: FloatArray
+    """Corners [4, 2] in the image, from the top left clockwise."""
+    depth: float
+
+
+def view_wall(target: Target, wall: Wall) -> WallView | None:
+    """How a wall is seen, None where it is not."""
     camera, ego = target.camera, target.ego
     if not wall.faces(ego):
-        return
-    base = np.array([[*wall.start, 0.0], [*wall.stop, 0.0]])
-    camera_base = camera.to_camera(ego.to_local(base))
-    half = camera.width / (2.0 * camera.intrinsics.fx) * 1.15 + 0.03
-    low, high = visible_span(camera_base, half)
+        return None
+    cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
+    down, level = math.sin(camera.pitch_down_rad), math.cos(camera.pitch_down_rad)
+    mount, k = camera.mount_height_m, camera.intrinsics
+    (ax, ay), (bx, by) = wall.start.tolist(), wall.stop.tolist()
+    ahead0, ahead1 = cosine * (ax - ego.x) + sine * (ay - ego.y), cosine * (bx - ego.x) + sine * (by - ego.y)
+    right0, right1 = sine * (ax - ego.x) - cosine * (ay - ego.y), sine * (bx - ego.x) - cosine * (by - ego.y)
+    half = camera.width / (2.0 * k.fx) * 1.15 + 0.03
+    low, high = visible_span(right0, level * ahead0 + down * mount, right1, level * ahead1 + down * mount, half)
     if high - low < 1e-4:
-        return
-    texture = wall.texture
-    left, right = wall.start + low * (wall.stop - wall.start), wall.start + high * (wall.stop - wall.start)
-    corners = np.array([[*left, texture.height_m], [*right, texture.height_m], [*right, 0.0], [*left, 0.0]])
-    camera_points = camera.to_camera(ego.to_local(corners))
-    pixels = camera.image_points(camera_points)
+        return None
+    corners, depths = [], 0.0
+    for share, up in ((low, wall.texture.height_m), (high, wall.texture.height_m), (high, 0.0), (low, 0.0)):
+        ahead, right = ahead0 + share * (ahead1 - ahead0), right0 + share * (right1 - right0)
+        depth = level * ahead + down * (mount - up)
+        below = level * (mount - up) - down * ahead
+        inverse = 1.0 / max(depth, 1e-6)
+        corners.append((k.fx * right * inverse + k.cx, k.fy * below * inverse + k.cy))
+        depths += depth
+    return WallView(wall, low, high, np.array(corners), depths / 4.0)
+
+
+def draw_wall(target: Target, view: WallView) -> None:
+    """Draw one wall, lit and hazed."""
+    pixels, low, high, texture = view.pixels, view.low, view.high, view.wall.texture
     window = window_around(target, pixels, 1)
     if window is None:
         return
@@ -93,7 +124,7 @@ def draw_wall(target: Target, wall: Wall) -> None:
     matrix = cv2.getPerspectiveTransform((source - 0.5).astype(np.float32), destination.astype(np.float32))
     size = (window.x1 - window.x0, window.y1 - window.y0)
     warped = cv2.warpPerspective(picture, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    finish(target, window, np.asarray(warped, np.uint8), pixels, wall.normal, float(camera_points[:, 2].mean()))
+    finish(target, window, np.asarray(warped, np.uint8), pixels, view.wall.normal, view.depth)
 
 
 def finish(
@@ -169,10 +200,31 @@ class Building:
         if not shadows.outside(self.pose, SHADOW_REACH_M):
             shadows.throw(self.outline, 0.0, self.height)
 
-    def draw(self, target: Target) -> None:
+    @property
+    def space(self) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it."""
+        middle = self.outline.mean(axis=0)
+        if self.roof is None:
+            return self.outline, self.height
+        return middle + (self.outline - middle) * 1.25, float(self.roof.corners[2].max())
+
+    def prepare(self, target: Target, occlusion: Occlusion) -> Callable[[], None]:
+        """Find the walls in sight, add them to what is covered; returns what draws them."""
+        views: list[WallView] = []
+        for wall in reversed(self.walls):
+            view = view_wall(target, wall)
+            if view is None:
+                continue
+            (x0, y0), (x1, y1) = view.pixels.min(axis=0).tolist(), view.pixels.max(axis=0).tolist()
+            if not occlusion.hides((x0 - 3.0, y0 - 3.0, x1 + 3.0, y1 + 3.0)):
+                occlusion.cover(view.pixels)
+                views.append(view)
+        return partial(self.draw, target, views[::-1])
+
+    def draw(self, target: Target, views: list[WallView]) -> None:
         """Walls, then the roof."""
-        for wall in self.walls:
-            draw_wall(target, wall)
+        for view in views:
+            draw_wall(target, view)
         if self.roof is not None:
             draw_mesh(target, self.roof, self.pose)
 

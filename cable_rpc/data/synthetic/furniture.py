@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy.typing as npt
 
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.mesh import Mesh, MeshBuilder
+from cable_rpc.data.synthetic.occlusion import Occlusion, square
 from cable_rpc.data.synthetic.raster import Target, draw_mesh
 from cable_rpc.data.synthetic.road import Pose
 from cable_rpc.data.synthetic.scenario import bgr
@@ -55,6 +58,17 @@ class Fixture:
     def shadow(self, shadows: ShadowLayer) -> None:
         """The shadow of a thin post."""
         shadows.add_box(self.pose, self.width, self.width, self.height)
+
+    @property
+    def space(self) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it."""
+        return square(self.pose.x, self.pose.y, float(np.hypot(*self.mesh.corners[:2]).max())), float(
+            self.mesh.corners[2].max()
+        )
+
+    def prepare(self, target: Target, occlusion: Occlusion) -> Callable[[], None]:
+        """What draws it; it hides nothing behind it."""
+        return partial(self.draw, target)
 
     def draw(self, target: Target) -> None:
         """Draw it."""

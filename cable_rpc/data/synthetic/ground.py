@@ -20,6 +20,8 @@ VISIBLE_M = 340.0
 CACHED_TILES = 2400
 MOSAIC_MARGIN = 3
 FADED_ROWS = 40
+SHARPNESS = 1.05
+"""Texels per pixel across the view at the far end of a band."""
 
 UInt8Array = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
@@ -87,7 +89,7 @@ class Ground:
         image[top:limit] = self.painter.far_colour
         lower, level, focal = height, 0, self.camera.intrinsics.fx
         while lower > limit:
-            far = FINEST_TEXEL_M * 2.0**level * focal * 1.25
+            far = FINEST_TEXEL_M * 2.0**level * focal * SHARPNESS
             upper = limit if far >= VISIBLE_M else max(limit, math.ceil(self.camera.row_at_distance(far)))
             if upper < lower:
                 self.render_band(image, pose, level, (upper, lower))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -47,6 +47,10 @@ COATS = tuple(
 TROUSERS = tuple(bgr(*rgb) for rgb in ((40, 50, 76), (34, 34, 38), (92, 84, 70), (64, 74, 96), (120, 110, 92)))
 SHOE = bgr(30, 28, 28)
 TYRE = bgr(28, 28, 30)
+LIT_SIDE_PIXELS = 2.0
+"""Radius of the thickest limb from which its lit side is told apart."""
+FAR_M = 30.0
+FAR_PHASES = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,8 @@ class Look:
     frame: FloatArray
     long_coat: bool
     long_hair: bool
+    far_poses: dict[tuple[float, int], list[Limb]] = field(default_factory=dict, repr=False)
+    """Walking limbs by stride and rounded phase, as seen from afar."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +191,22 @@ def walking_limbs(look: Look, phase: float, stride: float) -> list[Limb]:
     return limbs + head_limbs(look, vec(0.0, 0, 0.82 * g + sway), 0.012 * g, False)
 
 
+def far_walking_limbs(look: Look, phase: float, stride: float) -> list[Limb]:
+    """`walking_limbs` in the nearest of a few phases, each built once."""
+    step = round(phase / (2.0 * math.pi) * FAR_PHASES) % FAR_PHASES
+    key = (stride, step)
+    if key not in look.far_poses:
+        look.far_poses[key] = walking_limbs(look, step * 2.0 * math.pi / FAR_PHASES, stride)
+    return look.far_poses[key]
+
+
+def draw_walker(target: Target, look: Look, phase: float, stride: float, pose: Pose, ident: int) -> float:
+    """Draw a person on foot; returns the projected area in pixels, image border ignored."""
+    far = math.hypot(pose.x - target.ego.x, pose.y - target.ego.y) > FAR_M
+    limbs = far_walking_limbs(look, phase, stride) if far else walking_limbs(look, phase, stride)
+    return draw_limbs(target, limbs, pose, ident)
+
+
 def cycling_limbs(look: Look, crank: float) -> list[Limb]:
     """A rider on a bicycle with the crank at an angle (radians); the wheels touch z = 0."""
     g, radius = look.height, 0.34
@@ -280,7 +302,7 @@ def paint_limbs(
     toward = np.array([math.copysign(0.38, sun_right), -0.22])
     base, lit = light.sky * 0.62 + light.bounce * 0.38, light.sky * 0.8 + light.bounce * 0.2 + light.sun * 0.75
     means = depth.mean(axis=1)
-    passes = ((1.0, base), (0.62, lit)) if float(radii.max()) > 1.2 else ((1.0, (base + lit) / 2),)
+    passes = ((1.0, base), (0.62, lit)) if float(radii.max()) > LIT_SIDE_PIXELS else ((1.0, (base + lit) / 2),)
     albedo = np.array([limb.colour for limb in limbs])
     drawn = []
     for share, received in passes:

@@ -23,7 +23,9 @@ IntArray = npt.NDArray[np.int64]
 SUBPIXEL_BITS = 4
 SUBPIXEL = 1 << SUBPIXEL_BITS
 SILHOUETTE_SIDE = 160
-LEAST_FACE_PIXELS = 0.8
+LEAST_FACE_PIXELS = 1.3
+FAR_M = 40.0
+FAINT_GLOSS = 0.25
 FARTHEST = 2.0**20
 CLOSE_M = 3.0
 
@@ -116,8 +118,13 @@ def blend(area: UInt8Array, premultiplied: UInt8Array, alpha: UInt8Array) -> Non
     cv2.add(cv2.multiply(area, rest, dst=rest, scale=1.0 / 255.0), premultiplied, dst=area)
 
 
-def shade(mesh: Mesh, faces: IntArray, light: Light, heading: float, view: FloatArray) -> FloatArray:
-    """Colours [N, 3] of the given faces [N]; `view` [N, 3] points from the face to the eye in mesh axes."""
+def shade(
+    mesh: Mesh, faces: IntArray, light: Light, heading: float, view: FloatArray, least_gloss: float = 0.0
+) -> FloatArray:
+    """Colours [N, 3] of the given faces [N]; `view` [N, 3] points from the face to the eye in mesh axes.
+
+    Where no face has more than `least_gloss`, reflections are left out.
+    """
     cosine, sine = math.cos(heading), math.sin(heading)
     sun = light.sun_direction
     local = np.array([cosine * sun[0] + sine * sun[1], sine * sun[0] - cosine * sun[1], sun[2]])
@@ -126,7 +133,7 @@ def shade(mesh: Mesh, faces: IntArray, light: Light, heading: float, view: Float
     lit = np.maximum(normals @ local, 0.0)[:, None]
     received = light.bounce + upward * (light.sky - light.bounce) + lit * light.sun
     body = mesh.colours[faces] * np.where(dull, received, 1.0)
-    if not gloss.any():
+    if gloss.max() <= least_gloss:
         return np.asarray(body)
     facing = np.clip(np.einsum("ij,ij->i", normals, view), 0.0, 1.0)
     mirrored = (2.0 * facing)[:, None] * normals - view
@@ -194,7 +201,7 @@ def draw_mesh(target: Target, mesh: Mesh, pose: Pose, ident: int = 0) -> float:
         half = camera.width / (2.0 * k.fx) + 0.01
         if depths.max() <= NEAR_PLANE_M or (across > half * depths).all() or (across < -half * depths).all():
             return 0.0
-    # A face below about half a pixel only costs time.
+    # A detail of about a pixel only costs time.
     least = LEAST_FACE_PIXELS * max(nearest, NEAR_PLANE_M) / camera.intrinsics.fx
     faces = np.flatnonzero((mesh.normals @ eye > mesh.offsets) & (mesh.sizes > least))
     if not len(faces):
@@ -222,12 +229,15 @@ def draw_mesh(target: Target, mesh: Mesh, pose: Pose, ident: int = 0) -> float:
         columns, rows = np.clip(columns, -4000.0, 8000.0), np.clip(rows, -4000.0, 8000.0)
     low, high = (float(columns.min()), float(rows.min())), (float(columns.max()), float(rows.max()))
     extent = max(high[0] - low[0], high[1] - low[1])
-    window = window_between(target, low, high, 4 if extent < 60 else 3 if extent < 140 else 2)
+    window = window_between(target, low, high, 4 if extent < 40 else 3 if extent < 90 else 2)
     if window is None:
         return 0.0
     corners = np.stack([columns, rows], axis=1)
     view = to_eye[rank] / np.maximum(distance[rank], 1e-6)[:, None]
-    colours = haze(shade(mesh, faces, target.light, pose.heading, view), target.light, float(depths.mean()))
+    least_gloss = FAINT_GLOSS if nearest > FAR_M else 0.0
+    colours = haze(
+        shade(mesh, faces, target.light, pose.heading, view, least_gloss), target.light, float(depths.mean())
+    )
     paint = np.empty((len(faces), 4))
     np.clip(colours, 0, 255, out=paint[:, :3])
     paint[:, 3] = 255.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +13,7 @@ from cable_rpc.data.synthetic.buildings import Building, build_building, hide_pa
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.facades import Texture, facade, plain_wall
 from cable_rpc.data.synthetic.furniture import Fixture, bin_or_box, bollard, lamp_post, sign
+from cable_rpc.data.synthetic.occlusion import Occlusion
 from cable_rpc.data.synthetic.raster import Target
 from cable_rpc.data.synthetic.road import Pose, Road
 from cable_rpc.data.synthetic.scenario import Light, Street, bgr
@@ -50,8 +52,13 @@ class Prop(Protocol):
         """Add its shadow."""
         ...
 
-    def draw(self, target: Target) -> None:
-        """Draw it."""
+    @property
+    def space(self) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it."""
+        ...
+
+    def prepare(self, target: Target, occlusion: Occlusion) -> Callable[[], None]:
+        """Add what it covers of the image; returns what draws it."""
         ...
 
 

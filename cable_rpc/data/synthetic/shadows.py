@@ -17,6 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 
 SHRINK = 2
 SHADOWS_M = 60.0
+CORNERS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]] * 2)
+CONTACT_CORNERS = CORNERS * np.repeat([0.11, 0.025], 4)[:, None]
+"""How far the outlines of the contact shadow stand out, metres."""
 
 
 class ShadowLayer:
@@ -43,10 +46,18 @@ class ShadowLayer:
         )
         homography = to_mask @ camera.ground_to_image @ to_vehicle
         self.linear, self.offset = homography[:, :2].T.copy(), homography[:, 2]
+        self.from_mask = np.linalg.pinv(self.linear)
+        light = target.light
+        rise = max(float(light.sun_direction[2]), 0.18)
+        self.slope = -light.sun_direction[:2] / rise if light.shadow > 0.15 else None
+        """Ground offset of a shadow per metre of height, None without cast shadows."""
 
     def fill(self, mask: UInt8Array, outline: FloatArray, strength: int) -> None:
         """Darken a convex ground polygon [N, 2] given in world metres."""
-        points = outline @ self.linear + self.offset
+        self.lay(mask, outline @ self.linear + self.offset, strength)
+
+    def lay(self, mask: UInt8Array, points: FloatArray, strength: int) -> None:
+        """Darken a convex outline given in homogeneous mask points [N, 3]."""
         # The third homogeneous coordinate is the depth in metres.
         if points[:, 2].min() < NEAR_PLANE_M:
             points = clip_near(points)
@@ -59,20 +70,39 @@ class ShadowLayer:
         """The contact shadow under an object and the shadow its box throws from the sun."""
         if self.outside(pose, max(length, height * 2)):
             return
-        for grow, strength in ((0.22, 90), (0.05, 190)):
-            self.fill(self.contact, pose.to_world(rectangle(length + grow, width + grow)), strength)
-        self.throw(pose.to_world(rectangle(length * 0.94, width * 0.94)), 0.1, height * 0.94)
+        cosine, sine = math.cos(pose.heading), math.sin(pose.heading)
+        axes = np.array([[cosine, sine], [sine, -cosine]]) @ self.linear
+        centre = pose.x * self.linear[0] + pose.y * self.linear[1] + self.offset
+        sizes = np.array([length, width]) / 2.0
+        # The sun's offsets of the lower and upper outline join the two rectangles on the ground.
+        points = (CONTACT_CORNERS + CORNERS * sizes) @ axes + centre
+        self.lay(self.contact, points[:4], 90)
+        self.lay(self.contact, points[4:], 190)
+        if self.slope is None:
+            return
+        base = (CORNERS[:4] * (sizes * 0.94)) @ axes + centre
+        thrown = self.slope @ self.linear
+        self.lay_hull(np.vstack([base + thrown * 0.1, base + thrown * (height * 0.94)]))
 
     def throw(self, base: FloatArray, low: float, high: float) -> None:
         """The cast shadow of a prism over the world polygon [N, 2] between two heights."""
-        light = self.target.light
-        if light.shadow <= 0.15:
+        if self.slope is None:
             return
-        rise = max(float(light.sun_direction[2]), 0.18)
-        slope = -light.sun_direction[:2] / rise
-        outline = np.vstack([base + slope * low, base + slope * high])
-        hull = cv2.convexHull(outline.astype(np.float32))[:, 0].astype(np.float64)
-        self.fill(self.cast, hull, 255)
+        projected, thrown = base @ self.linear + self.offset, self.slope @ self.linear
+        self.lay_hull(np.vstack([projected + thrown * low, projected + thrown * high]))
+
+    def lay_hull(self, points: FloatArray) -> None:
+        """Cast shadow over the convex hull of homogeneous mask points [N, 3]."""
+        if points[:, 2].min() >= NEAR_PLANE_M:
+            # Projection keeps convexity, so the hull may be taken in the image.
+            flat = np.clip(points[:, :2] / points[:, 2:], -60000, 120000).astype(np.int32)
+            cv2.fillConvexPoly(self.cast, cv2.convexHull(flat), 255, cv2.LINE_8, SUBPIXEL_BITS)
+            return
+        if points[:, 2].max() < NEAR_PLANE_M:
+            return
+        ground = (points - self.offset) @ self.from_mask
+        order = cv2.convexHull(ground.astype(np.float32), returnPoints=False)[:, 0]
+        self.lay(self.cast, points[order], 255)
 
     def outside(self, pose: Pose, reach: float) -> bool:
         """Whether nothing near the pose can reach the image."""

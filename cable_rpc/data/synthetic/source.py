@@ -64,6 +64,7 @@ class SyntheticSource:
             math.radians(config.pitch_down_deg),
         )
         duration_s = (config.frame_count - 1) / config.fps + 0.5
+        self.intrinsics = self.camera.intrinsics
         self.world = World(
             config.seed, self.camera, duration_s, config.noise_strength, config.blur_sigma, config.vignette
         )

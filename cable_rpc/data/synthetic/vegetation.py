@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.synthetic.camera import Camera
+from cable_rpc.data.synthetic.occlusion import Occlusion, square
 from cable_rpc.data.synthetic.raster import Target, Window, composite
 from cable_rpc.data.synthetic.road import Pose
 from cable_rpc.data.synthetic.scenario import Light, bgr
@@ -167,6 +170,16 @@ class Plant:
         place = (self.x, self.y)
         shadows.throw(CIRCLE * self.crown + place, self.height * 0.4, self.height * 0.8)
         shadows.fill(shadows.contact, CIRCLE * (self.crown * 0.3) + place, 110)
+
+    @property
+    def space(self) -> tuple[FloatArray, float]:
+        """Footprint [4, 2], world metres, and height that hold all of it."""
+        full = self.sprite.levels[0]
+        return square(self.x, self.y, self.height * full.shape[1] / (2.0 * full.shape[0])), self.height
+
+    def prepare(self, target: Target, occlusion: Occlusion) -> Callable[[], None]:
+        """What draws it; it hides nothing behind it."""
+        return partial(self.draw, target)
 
     def draw(self, target: Target) -> None:
         """Draw it as an upright picture that faces the camera."""

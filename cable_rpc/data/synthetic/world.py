@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from cable_rpc.data.synthetic.actors import KIND_LENGTHS, KIND_SHARES, actor_pos
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.ground import Ground
 from cable_rpc.data.synthetic.groundpaint import GroundPainter
+from cable_rpc.data.synthetic.occlusion import Occlusion, image_bounds
 from cable_rpc.data.synthetic.population import populate
 from cable_rpc.data.synthetic.raster import Target
 from cable_rpc.data.synthetic.render import Drawn, collect_truth
@@ -25,6 +27,8 @@ from cable_rpc.types import EgoMotion, GroundTruth, Image
 VIEW_AHEAD_M = 170.0
 ACTORS_AHEAD_M = 105.0
 VIEW_BEHIND_M = 14.0
+Entry = tuple[float, int, Prop | None, int, Pose]
+"""Distance, place among the props or the actors, the prop or None, identity, pose."""
 SKYLINES_RAD = {"city": 0.05, "boulevard": 0.05, "suburb": 0.035, "country": 0.03}
 
 
@@ -49,6 +53,7 @@ class World:
             rng, self.road, self.street, self.light, self.traffic.crossings, self.reach_m
         )
         self.anchors = np.array([[*prop.anchor, prop.shadow_reach, prop.s] for prop in self.props]).reshape(-1, 5).T
+        self.spaces = [prop.space for prop in self.props]
         self.sensor = Sensor(seed, camera.width, camera.height, noise, blur, vignette)
 
     def ego(self, time_s: float) -> tuple[Pose, EgoMotion]:
@@ -79,6 +84,28 @@ class World:
         shadowing = along & (forward > -margin) & (forward < SHADOWS_M + margin) & (aside < wedge + margin)
         return np.flatnonzero(seen).tolist(), np.flatnonzero(shadowing).tolist()
 
+    def in_sight(self, target: Target, queue: list[Entry]) -> list[tuple[Callable[[], None] | None, int, Pose]]:
+        """The entries, given far to near, that nearer ones don't hide; what draws a prop, None for an actor."""
+        if not queue:
+            return []
+        spaces = [
+            self.spaces[place] if prop is not None else self.actors[place].space(where)
+            for _, place, prop, _, where in queue
+        ]
+        footprints, heights = np.array([space[0] for space in spaces]), np.array([space[1] for space in spaces])
+        bounds = image_bounds(target.camera, target.ego, footprints, heights)
+        occlusion = Occlusion(target.camera)
+        kept: list[tuple[Callable[[], None] | None, int, Pose]] = []
+        for (_, place, prop, ident, where), (x0, y0, x1, y1) in zip(reversed(queue), reversed(bounds), strict=True):
+            if occlusion.hides((x0, y0, x1, y1)):
+                continue
+            if prop is not None:
+                kept.append((prop.prepare(target, occlusion), ident, where))
+                continue
+            self.actors[place].cover(target, occlusion, where)
+            kept.append((None, ident, where))
+        return kept[::-1]
+
     def render(self, time_s: float, index: int) -> tuple[Image, GroundTruth]:
         """The camera frame and its truth at a time; `index` chooses the sensor noise."""
         camera, pose = self.camera, self.ego(time_s)[0]
@@ -88,7 +115,7 @@ class World:
         self.ground.render(image, pose)
         ego_s = float(self.traffic.at(time_s)[0][0])
         shadows = ShadowLayer(target)
-        queue: list[tuple[float, int, Prop | None, int, Pose]] = []
+        queue: list[Entry] = []
         seen, shadowing = self.nearby(pose, ego_s)
         for place in seen:
             distance = self.props[place].distance(pose, camera)
@@ -108,9 +135,9 @@ class World:
         shadows.apply()
         queue.sort(key=lambda entry: (-entry[0], entry[3], entry[1]))
         drawn: list[Drawn] = []
-        for _, _, scenery, ident, where in queue:
-            if scenery is not None:
-                scenery.draw(target)
+        for draw, ident, where in self.in_sight(target, queue):
+            if draw is not None:
+                draw()
             else:
                 actor = self.actors[ident - 1]
                 drawn.append(Drawn(actor, ident, actor.draw(target, where, time_s, ident)))
