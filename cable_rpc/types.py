@@ -199,8 +199,3 @@ class StageTimings:
     """Durations of named processing stages of one frame, in nanoseconds of the local monotonic clock."""
 
     stages_ns: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def total_ns(self) -> int:
-        """Sum of all stages."""
-        return sum(self.stages_ns.values())

@@ -18,6 +18,7 @@ from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
 from cable_rpc.study.summary_table import render_summary
 from cable_rpc.types import CameraIntrinsics
+from cable_rpc.wire.convert import CODECS_BY_NAME
 
 console = Console(width=None if sys.stdout.isatty() else 100)
 
@@ -73,7 +74,7 @@ def stream(
         raise ConfigurationError(f"--pace is '{pace}'; use lockstep or realtime")
     if strategy not in {"cable", "full-frame"}:
         raise ConfigurationError(f"--strategy is '{strategy}'; use cable or full-frame")
-    if codec not in {"h264", "jpeg", "webp"}:
+    if codec not in CODECS_BY_NAME:
         raise ConfigurationError(f"--codec is '{codec}'; use h264, jpeg or webp")
     frame_size = parse_size(size)
     opened = open_source(

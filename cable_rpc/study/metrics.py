@@ -187,21 +187,6 @@ def roi_overlap(truth_boxes: npt.ArrayLike, roi_pixels: BoolMask) -> Float64Arra
     return share
 
 
-def recognised(truth_boxes: npt.ArrayLike, roi_pixels: BoolMask, threshold: float = 0.05) -> npt.NDArray[np.bool_]:
-    """Which objects the region covers enough to be recognised (paper section 4; box rule of ``roi_overlap``).
-
-    Args:
-        truth_boxes: [N, 4] xyxy in pixels.
-        roi_pixels: bool [height, width].
-        threshold: Least covered share of the box.
-
-    Returns:
-        bool [N]. An empty box is never recognised.
-    """
-    overlap = roi_overlap(truth_boxes, roi_pixels)
-    return (overlap >= threshold) & (overlap > 0.0)
-
-
 def recognition_curve(
     truth_boxes: npt.ArrayLike,
     roi_pixels: BoolMask,

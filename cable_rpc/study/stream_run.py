@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from cable_codecs import CodecParameters
+from cable_codecs import DEFAULT_CRF, DEFAULT_QUALITY, CodecParameters
 
 import cable_rpc
 from cable_rpc.data.source import FrameSource
@@ -202,9 +202,10 @@ class StreamRun:
         return summary
 
     def _quality_text(self) -> str:
-        defaults = {"h264": 28, "jpeg": 75, "webp": 75}
-        quality = self._config.quality if self._config.quality is not None else defaults[self._config.codec]
-        return f"CRF {quality}" if self._config.codec == "h264" else f"quality {quality}"
+        quality = self._config.quality
+        if self._config.codec == "h264":
+            return f"CRF {DEFAULT_CRF if quality is None else quality}"
+        return f"quality {DEFAULT_QUALITY if quality is None else quality}"
 
 
 def _only(source: Iterable[Frame], indices: set[int]) -> Iterator[Frame]:

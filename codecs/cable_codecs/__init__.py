@@ -6,11 +6,15 @@ Images are uint8 [height, width, 3] in BGR order; masks are bool [height, width]
 from cable_codecs.base import CodecParameters, Decoder, EncodedFrame, Encoder
 from cable_codecs.errors import CodecError, CodecUnavailableError
 from cable_codecs.fill import FillMode, fill_background
+from cable_codecs.h264 import DEFAULT_CRF
 from cable_codecs.mask_codec import decode_mask, encode_mask
 from cable_codecs.quality import roi_psnr, roi_ssim
 from cable_codecs.registry import available_codecs, create_decoder, create_encoder
+from cable_codecs.still import DEFAULT_QUALITY
 
 __all__ = [
+    "DEFAULT_CRF",
+    "DEFAULT_QUALITY",
     "CodecError",
     "CodecParameters",
     "CodecUnavailableError",
