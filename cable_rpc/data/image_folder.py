@@ -11,7 +11,7 @@ import numpy as np
 from cable_rpc.data.ego_csv import EgoLog
 from cable_rpc.data.resize import resize_image, scaled_intrinsics
 from cable_rpc.errors import SourceError
-from cable_rpc.types import CameraIntrinsics, Frame, Image
+from cable_rpc.types import CameraIntrinsics, CameraMount, Frame, Image
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 DEFAULT_FPS = 10.0
@@ -33,6 +33,7 @@ class ImageFolderSource:
         size: (width, height) to resize to.
         intrinsics: the camera, in pixels of the files.
         fps: rate at which the images were taken.
+        mount: where the camera sits on its vehicle.
 
     Raises:
         SourceError: no images, or the first can't be read.
@@ -47,6 +48,7 @@ class ImageFolderSource:
         size: tuple[int, int] | None = None,
         intrinsics: CameraIntrinsics | None = None,
         fps: float | None = None,
+        mount: CameraMount | None = None,
     ) -> None:
         self.name = path.resolve().name
         self.fps = DEFAULT_FPS if fps is None else fps
@@ -61,6 +63,7 @@ class ImageFolderSource:
         self._file_size_wh = (width, height)
         self.size_wh = (width, height) if size is None else size
         self._ego = ego
+        self.mount = mount
         self.intrinsics = scaled_intrinsics(intrinsics, self._file_size_wh, self.size_wh)
 
     def __iter__(self) -> Iterator[Frame]:
@@ -83,6 +86,7 @@ class ImageFolderSource:
                 capture_time_ns=round(time_s * NS_PER_S),
                 ego=None if self._ego is None else self._ego.at(number, time_s),
                 intrinsics=self.intrinsics,
+                mount=self.mount,
             )
 
 

@@ -6,9 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import parse_qsl
 
 from cable_rpc.errors import ConfigurationError
-from cable_rpc.types import CameraIntrinsics, Frame
+from cable_rpc.types import CameraIntrinsics, CameraMount, Frame
+
+MAX_PITCH_RAD = 1.2
+SYNTHETIC_KEYS = ("route", "traffic")
 
 
 class FrameSource(Protocol):
@@ -48,6 +52,7 @@ class SourceOptions:
     size: tuple[int, int] | None = None
     intrinsics: CameraIntrinsics | None = None
     fps: float | None = None
+    mount: CameraMount | None = None
 
     def __post_init__(self) -> None:
         if self.max_frames is not None and self.max_frames < 1:
@@ -56,6 +61,11 @@ class SourceOptions:
             raise ConfigurationError(f"size is {self.size[0]}x{self.size[1]}; give at least 1x1 pixels")
         if self.fps is not None and not 0 < self.fps < 1e6:
             raise ConfigurationError(f"fps is {self.fps}; give a positive frame rate")
+        if self.mount is not None and not (self.mount.height_m > 0 and abs(self.mount.pitch_down_rad) < MAX_PITCH_RAD):
+            raise ConfigurationError(
+                f"mount has height {self.mount.height_m} m and pitch {self.mount.pitch_down_rad} rad; give a height "
+                f"above 0 and a pitch of less than {MAX_PITCH_RAD} rad"
+            )
 
 
 SourceFactory = Callable[[str, SourceOptions], FrameSource]
@@ -77,24 +87,26 @@ def open_video(rest: str, options: SourceOptions) -> FrameSource:
         size=options.size,
         intrinsics=options.intrinsics,
         fps=options.fps,
+        mount=options.mount,
     )
 
 
 def open_synthetic(rest: str, options: SourceOptions) -> FrameSource:
-    """``synthetic:SEED``; ego-motion and intrinsics are the simulation's own."""
+    """``synthetic:SEED``, or ``synthetic:SEED?route=turns&traffic=none``; the simulation knows its own camera."""
     from cable_rpc.data.synthetic import SyntheticConfig, SyntheticSource
 
-    if options.ego_csv is not None or options.intrinsics is not None:
+    if options.ego_csv is not None or options.intrinsics is not None or options.mount is not None:
         raise ConfigurationError(
-            "a synthetic source simulates its own ego-motion and camera; leave ego_csv and intrinsics out"
+            "a synthetic source simulates its own ego-motion and camera; leave ego_csv, intrinsics and mount out"
         )
+    number, _, query = rest.partition("?")
     try:
-        seed = int(rest)
+        seed = int(number)
     except ValueError:
         raise ConfigurationError(f"'synthetic:{rest}': the seed must be a whole number") from None
     if seed < 0:
         raise ConfigurationError(f"'synthetic:{rest}': the seed must be at least 0")
-    settings: dict[str, Any] = {"seed": seed}
+    settings: dict[str, Any] = {"seed": seed, **synthetic_options(rest, query)}
     if options.size is not None:
         settings["width"], settings["height"] = options.size
     if options.fps is not None:
@@ -102,6 +114,23 @@ def open_synthetic(rest: str, options: SourceOptions) -> FrameSource:
     if options.max_frames is not None:
         settings["frame_count"] = options.max_frames
     return SyntheticSource(SyntheticConfig(**settings))
+
+
+def synthetic_options(rest: str, query: str) -> dict[str, str]:
+    """The ``key=value&...`` part of a synthetic source's name; the values are judged by `SyntheticConfig`."""
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+    except ValueError:
+        raise ConfigurationError(f"'synthetic:{rest}': write options as key=value, joined by &") from None
+    for key, _ in pairs:
+        if key not in SYNTHETIC_KEYS:
+            raise ConfigurationError(
+                f"'synthetic:{rest}': unknown option '{key}'; known are {', '.join(SYNTHETIC_KEYS)}"
+            )
+    options = dict(pairs)
+    if len(options) < len(pairs):
+        raise ConfigurationError(f"'synthetic:{rest}': give each option once")
+    return options
 
 
 SOURCES: Mapping[str, SourceFactory] = {"video": open_video, "synthetic": open_synthetic}
@@ -116,16 +145,19 @@ def open_source(
     size: tuple[int, int] | None = None,
     intrinsics: CameraIntrinsics | None = None,
     fps: float | None = None,
+    mount: CameraMount | None = None,
 ) -> FrameSource:
     """Open a frame source.
 
     Args:
-        spec: ``video:FILE``, ``video:FOLDER`` of images, or ``synthetic:SEED``.
+        spec: ``video:FILE``, ``video:FOLDER`` of images, or ``synthetic:SEED`` with options such as
+            ``?route=turns&traffic=none`` (`SyntheticConfig`).
         max_frames: stop after that many frames.
         ego_csv: ego-motion log for a video (``cable_rpc.data.ego_csv``).
         size: (width, height) to resize to; intrinsics are scaled along.
         intrinsics: the camera, in pixels of the video's own size.
         fps: frame rate; a video of a higher rate is thinned, a folder of images is played at it.
+        mount: where the camera of a video sits on its vehicle.
 
     Raises:
         ConfigurationError: unknown scheme or unusable option.
@@ -137,4 +169,4 @@ def open_source(
         known = ", ".join(f"{name}:..." for name in sorted(SOURCES))
         hint = f"; for a file write 'video:{spec}'" if Path(spec).exists() else ""
         raise ConfigurationError(f"can't open source '{spec}': known are {known}{hint}")
-    return factory(rest, SourceOptions(max_frames, ego_csv, size, intrinsics, fps))
+    return factory(rest, SourceOptions(max_frames, ego_csv, size, intrinsics, fps, mount))

@@ -14,7 +14,7 @@ from cable_rpc.data.colour import to_bgr
 from cable_rpc.data.ego_csv import EgoLog
 from cable_rpc.data.resize import resize_image, scaled_intrinsics
 from cable_rpc.errors import SourceError
-from cable_rpc.types import CameraIntrinsics, Frame
+from cable_rpc.types import CameraIntrinsics, CameraMount, Frame
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +31,7 @@ class VideoSource:
         size: (width, height) to resize to.
         intrinsics: the camera, in pixels of the file's frames as displayed.
         fps: thin to this rate where the file's is higher; times stay those of the kept frames.
+        mount: where the camera sits on its vehicle.
 
     Raises:
         SourceError: no such file, not a video, or not a single frame in it.
@@ -45,11 +46,13 @@ class VideoSource:
         size: tuple[int, int] | None = None,
         intrinsics: CameraIntrinsics | None = None,
         fps: float | None = None,
+        mount: CameraMount | None = None,
     ) -> None:
         self.name = path.stem
         self._path = path
         self._max_frames = max_frames
         self._ego = ego
+        self.mount = mount
         with open_container(path) as container:
             stream = container.streams.video[0]
             first = next(decode(path, container), None)
@@ -111,6 +114,7 @@ class VideoSource:
             capture_time_ns=time_ns,
             ego=None if self._ego is None else self._ego.at(number, time_ns / NS_PER_S),
             intrinsics=self.intrinsics,
+            mount=self.mount,
         )
 
 

@@ -36,6 +36,8 @@ HIDES_M = 70.0
 PERSON, BICYCLE, CAR, BUS, TRUCK = 0, 1, 2, 5, 7
 VEHICLE_KINDS = ("hatch", "sedan", "estate", "suv", "van", "panel_van", "truck", "bus")
 KIND_SHARES = np.array([0.22, 0.17, 0.13, 0.16, 0.07, 0.07, 0.11, 0.07])
+CORNER_SHARES = np.array([0.25, 0.2, 0.15, 0.18, 0.09, 0.13, 0.0, 0.0])
+"""Without what is too long to keep its lane in a tight corner."""
 KIND_LENGTHS = np.array([4.05, 4.65, 4.7, 4.55, 5.0, 5.0, TRUCK_LENGTH, BUS_LENGTH])
 KIND_CLASSES = (CAR, CAR, CAR, CAR, CAR, TRUCK, TRUCK, BUS)
 

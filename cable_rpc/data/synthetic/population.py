@@ -17,14 +17,17 @@ from cable_rpc.data.synthetic.actors import (
     Walker,
 )
 from cable_rpc.data.synthetic.people import draw_look
+from cable_rpc.data.synthetic.road import Road
 from cable_rpc.data.synthetic.scenario import Street
 from cable_rpc.data.synthetic.traffic import Traffic
 
 PARKED_SHARES = np.array([0.28, 0.2, 0.17, 0.19, 0.07, 0.09, 0.0, 0.0])
 MODELS_PER_KIND = 4
+NARROWEST_BAY = 0.8
+"""Length of a parking bay on the inside of a bend, as a share of one on a straight."""
 
 
-def populate(rng: np.random.Generator, street: Street, traffic: Traffic, reach_m: float) -> list[Actor]:
+def populate(rng: np.random.Generator, street: Street, road: Road, traffic: Traffic, reach_m: float) -> list[Actor]:
     """All actors between s = -20 m and `reach_m`; track ids count from 1."""
     models = [[VehicleModel(rng, kind) for _ in range(MODELS_PER_KIND)] for kind in range(len(KIND_SHARES))]
     actors: list[Actor] = []
@@ -32,7 +35,7 @@ def populate(rng: np.random.Generator, street: Street, traffic: Traffic, reach_m
     for index in range(1, len(traffic.kind)):
         model = models[int(traffic.kind[index])][int(rng.integers(MODELS_PER_KIND))]
         actors.append(Vehicle(len(actors) + 1, model, traffic, index, nowhere))
-    add_parked(rng, actors, street, traffic, models, reach_m)
+    add_parked(rng, actors, street, road, traffic, models, reach_m)
     add_walkers(rng, actors, street, reach_m)
     add_crossers(rng, actors, street, traffic)
     add_cyclists(rng, actors, street, reach_m)
@@ -43,6 +46,7 @@ def add_parked(
     rng: np.random.Generator,
     actors: list[Actor],
     street: Street,
+    road: Road,
     traffic: Traffic,
     models: list[list[VehicleModel]],
     reach_m: float,
@@ -57,6 +61,8 @@ def add_parked(
                 continue
             s = float(bay + 3.0 + rng.uniform(-0.3, 0.3))
             if any(abs(crossing.s - s) < 8.0 for crossing in traffic.crossings):
+                continue
+            if 1.0 + road.curvature_at(s) * side * place < NARROWEST_BAY:
                 continue
             kind = int(rng.choice(len(PARKED_SHARES), p=PARKED_SHARES))
             turned = (0.0 if side > 0 else math.pi) + float(rng.uniform(-0.03, 0.03))

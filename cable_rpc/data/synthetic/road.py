@@ -40,33 +40,17 @@ class Pose:
         return world
 
 
+def road_arc(length_m: float) -> FloatArray:
+    """Arc lengths, metres, at which a road of this drivable length is sampled."""
+    return np.arange(START_M, length_m + 500.0, STEP_M)
+
+
 class Road:
     """Centreline sampled every half metre; road coordinates are (s along, d to the right)."""
 
-    def __init__(self, rng: np.random.Generator, length_m: float, turn_rad: float, straight_m: float) -> None:
-        """Draw alternating straights and bends until the length is covered.
-
-        Args:
-            rng: Source of all choices.
-            length_m: Drivable length; the curve goes on straight for a while beyond it.
-            turn_rad: Largest heading away from the main direction, which keeps the road free of loops.
-            straight_m: Typical length of the straights.
-        """
-        self.arc = np.arange(START_M, length_m + 500.0, STEP_M)
-        curvature = np.zeros_like(self.arc)
-        position, heading = float(rng.uniform(-30.0, 0.5 * straight_m)), 0.0
-        while position < length_m + 300.0:
-            target = float(rng.uniform(0.35, 1.0) * turn_rad) * (-1.0 if heading > 0 else 1.0)
-            if abs(heading) < 1e-9 and rng.random() < 0.5:
-                target = -target
-            change = target - heading
-            bend = max(18.0, abs(change) * float(rng.uniform(85.0, 140.0)))
-            # A raised-cosine bend has a continuous curvature, so the yaw rate never jumps.
-            inside = (self.arc >= position) & (self.arc < position + bend)
-            phase = (self.arc[inside] - position) / bend
-            curvature[inside] += change / bend * (1.0 - np.cos(2.0 * math.pi * phase))
-            heading = target
-            position += bend + float(rng.uniform(0.2, 0.8)) * straight_m
+    def __init__(self, curvature: FloatArray) -> None:
+        """Integrate a curvature, 1/m and positive to the left, given every `STEP_M` from `START_M` on."""
+        self.arc = START_M + STEP_M * np.arange(len(curvature))
         self.curvature = curvature
         middle = (curvature[1:] + curvature[:-1]) / 2.0
         self.heading = np.concatenate([[0.0], np.cumsum(middle) * STEP_M])

@@ -11,11 +11,13 @@ import numpy.typing as npt
 
 from cable_rpc.data.synthetic.buildings import Building, build_building, hide_party_wall
 from cable_rpc.data.synthetic.camera import Camera
+from cable_rpc.data.synthetic.corners import fits, footprint, front_along, standing_room
 from cable_rpc.data.synthetic.facades import Texture, facade, plain_wall
 from cable_rpc.data.synthetic.furniture import Fixture, bin_or_box, bollard, lamp_post, sign
 from cable_rpc.data.synthetic.occlusion import Occlusion
 from cable_rpc.data.synthetic.raster import Target
 from cable_rpc.data.synthetic.road import Pose, Road
+from cable_rpc.data.synthetic.route import Route
 from cable_rpc.data.synthetic.scenario import Light, Street, bgr
 from cable_rpc.data.synthetic.shadows import ShadowLayer
 from cable_rpc.data.synthetic.traffic import Crossing
@@ -26,6 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 FACADES = 9
 TREES = 5
 BEGIN_M = -60.0
+OPEN_STEP_M = 1.5
 ROOFS = (bgr(146, 78, 56), bgr(92, 84, 82), bgr(120, 66, 52), bgr(70, 72, 78))
 
 
@@ -63,17 +66,37 @@ class Prop(Protocol):
 
 
 def build_scenery(
-    rng: np.random.Generator, road: Road, street: Street, light: Light, crossings: tuple[Crossing, ...], reach_m: float
+    rng: np.random.Generator,
+    road: Road,
+    street: Street,
+    route: Route,
+    light: Light,
+    crossings: tuple[Crossing, ...],
+    reach_m: float,
 ) -> list[Prop]:
     """All still objects along the road."""
     props: list[Prop] = []
-    add_buildings(rng, props, road, street, reach_m)
+    add_buildings(rng, props, road, street, route, reach_m)
+    buildings = [prop for prop in props if isinstance(prop, Building)]
     add_plants(rng, props, road, street, light, reach_m)
     add_furniture(rng, props, road, street, light, crossings, reach_m)
-    return props
+    if not route.corners:
+        return props
+    # Inside a corner, what was placed beside one leg of the road may stand on the other.
+    small = props[len(buildings) :]
+    places = np.array([prop.anchor[:2] for prop in small]).reshape(-1, 2)
+    free = standing_room(road, places, street.road_half_width + 0.3, buildings)
+    return [*buildings, *(prop for prop, kept in zip(small, free, strict=True) if kept)]
 
 
-def add_buildings(rng: np.random.Generator, props: list[Prop], road: Road, street: Street, reach_m: float) -> None:
+def building_line(street: Street) -> float:
+    """Distance of the building line from the centreline, metres."""
+    return street.road_half_width + 0.16 + street.pavement + street.verge + street.building_gap
+
+
+def add_buildings(
+    rng: np.random.Generator, props: list[Prop], road: Road, street: Street, route: Route, reach_m: float
+) -> None:
     """Terraces in town, single houses outside."""
     house = street.houses
     widths = rng.uniform(8.0, 12.0, FACADES) if house else rng.uniform(9.0, 18.0, FACADES)
@@ -90,7 +113,10 @@ def add_buildings(rng: np.random.Generator, props: list[Prop], road: Road, stree
     depth = 8.0 if house else 12.0
     ends = [plain_wall(rng, depth, front.height_m) for front in fronts]
     backs = [plain_wall(rng, front.width_m, front.height_m) for front in fronts[:1]]
-    line = street.road_half_width + 0.16 + street.pavement + street.verge + street.building_gap
+    line = building_line(street)
+    if route.corners:
+        line_corners(rng, props, road, street, fronts, ends, backs[0], reach_m)
+        return
     for side in (1, -1):
         s = BEGIN_M + float(rng.uniform(0.0, 8.0))
         before: Building | None = None
@@ -117,6 +143,41 @@ def add_buildings(rng: np.random.Generator, props: list[Prop], road: Road, stree
             else:
                 gap = float(rng.uniform(3.0, 9.0)) if rng.random() < 0.15 else 0.05
             s, before = s + front.width_m + gap, building
+
+
+def line_corners(
+    rng: np.random.Generator,
+    props: list[Prop],
+    road: Road,
+    street: Street,
+    fronts: list[Texture],
+    ends: list[Texture],
+    back: Texture,
+    reach_m: float,
+) -> None:
+    """Buildings shoulder to shoulder around tight corners; where none fits, the corner stays open."""
+    house = street.houses
+    depth = 8.0 if house else 12.0
+    line = building_line(street)
+    built: list[Building] = []
+    for side in (1, -1):
+        s = BEGIN_M
+        while s < reach_m + 90.0:
+            choice = int(rng.integers(FACADES))
+            front = fronts[choice]
+            found = front_along(road, s, side, line, front.width_m)
+            if found is None or not fits(road, footprint(found[0], front.width_m, depth), line, built):
+                s += OPEN_STEP_M
+                continue
+            pose, stop = found
+            roof = ROOFS[int(rng.integers(len(ROOFS)))] if house else None
+            building = build_building((s + stop) / 2.0, pose, front.width_m, depth, front, ends[choice], back, roof)
+            if built and not house:
+                hide_party_wall(building, built[-1], 0.0)
+                hide_party_wall(built[-1], building, 0.0)
+            built.append(building)
+            s = stop + (float(rng.uniform(2.0, 6.0)) if house else 0.0)
+    props += built
 
 
 def add_plants(

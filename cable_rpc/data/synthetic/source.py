@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from urllib.parse import urlencode
 
 from cable_rpc.data.synthetic.camera import Camera
+from cable_rpc.data.synthetic.route import ROUTES, STREETS_ROUTE, TRAFFICS
 from cable_rpc.data.synthetic.world import World
 from cable_rpc.errors import ConfigurationError
-from cable_rpc.types import Frame
+from cable_rpc.types import CameraMount, Frame
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,10 @@ class SyntheticConfig:
     """Lens blur in pixels."""
     vignette: float = 0.28
     """Loss of light in the corners, 0..1."""
+    route: str = STREETS_ROUTE.name
+    """`streets`; `turns`: one tight corner after the other; `straight`; `standstill`: waiting at a red light."""
+    traffic: str = "normal"
+    """`none` is the same drive through the same streets with nobody in sight."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -42,6 +48,18 @@ class SyntheticConfig:
             raise ConfigurationError(f"SyntheticConfig.frame_count is {self.frame_count}; use 1 or more")
         if not 20.0 <= self.horizontal_fov_deg <= 120.0:
             raise ConfigurationError(f"SyntheticConfig.horizontal_fov_deg is {self.horizontal_fov_deg}; use 20..120")
+        if self.route not in ROUTES:
+            raise ConfigurationError(f"SyntheticConfig.route is '{self.route}'; known are {', '.join(ROUTES)}")
+        if self.traffic not in TRAFFICS:
+            raise ConfigurationError(f"SyntheticConfig.traffic is '{self.traffic}'; known are {', '.join(TRAFFICS)}")
+
+    @property
+    def name(self) -> str:
+        """The source spec of this world: ``synthetic:SEED``, and its route and traffic where not the defaults."""
+        chosen = {"route": self.route, "traffic": self.traffic}
+        usual = {"route": STREETS_ROUTE.name, "traffic": "normal"}
+        options = urlencode({key: value for key, value in chosen.items() if value != usual[key]})
+        return f"synthetic:{self.seed}" + (f"?{options}" if options else "")
 
 
 class SyntheticSource:
@@ -52,7 +70,7 @@ class SyntheticSource:
 
     def __init__(self, config: SyntheticConfig) -> None:
         self.config = config
-        self.name = f"synthetic:{config.seed}"
+        self.name = config.name
         self.fps = config.fps
         self.size_wh = (config.width, config.height)
         self.frame_count = config.frame_count
@@ -65,8 +83,16 @@ class SyntheticSource:
         )
         duration_s = (config.frame_count - 1) / config.fps + 0.5
         self.intrinsics = self.camera.intrinsics
+        self.mount = CameraMount(config.mount_height_m, math.radians(config.pitch_down_deg))
         self.world = World(
-            config.seed, self.camera, duration_s, config.noise_strength, config.blur_sigma, config.vignette
+            config.seed,
+            self.camera,
+            duration_s,
+            ROUTES[config.route],
+            config.traffic != "none",
+            config.noise_strength,
+            config.blur_sigma,
+            config.vignette,
         )
 
     def __len__(self) -> int:
@@ -98,4 +124,5 @@ class SyntheticSource:
             self.world.ego(time_s)[1],
             self.camera.intrinsics,
             truth,
+            self.mount,
         )

@@ -6,12 +6,14 @@ and microscopic simulations".
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from cable_rpc.data.synthetic.road import Road
+from cable_rpc.data.synthetic.road import STEP_M, Road
+from cable_rpc.data.synthetic.route import Route
 from cable_rpc.data.synthetic.scenario import Street
 
 FloatArray = npt.NDArray[np.float64]
@@ -23,6 +25,11 @@ FOLLOW_GAP_M = 2.5
 HEADWAY_S = 1.4
 ACCELERATION = 1.6
 DECELERATION = 2.4
+CORNER_BRAKING = 1.8
+"""Deceleration with which drivers approach a corner, m/s²."""
+RED_LIGHT_M = 6.2
+"""Where the crossing lies at which the ego vehicle stands."""
+CLEAR_OF_LIGHT_M = 30.0
 
 
 @dataclass(slots=True)
@@ -77,6 +84,32 @@ def place_crossings(rng: np.random.Generator, street: Street, length_m: float) -
     return tuple(crossings)
 
 
+def crossings_on(
+    rng: np.random.Generator, road: Road, street: Street, route: Route, duration_s: float
+) -> tuple[Crossing, ...]:
+    """Zebra crossings of a route and the red phases that don't depend on the ego vehicle's arrival."""
+    crossings = place_crossings(rng, street, duration_s * street.cruise_mps * 1.15)
+    if route.stands:
+        for crossing in crossings:
+            crossing.stops_ego = False
+        return (red_light(rng, street, duration_s), *(other for other in crossings if other.s > CLEAR_OF_LIGHT_M))
+    if route.corners:
+        straight = [c for c in crossings if np.abs(road.curvature[np.abs(road.arc - c.s) < 5.0]).max() < 0.01]
+        return tuple(Crossing(crossing.s, False, crossing.hold_s) for crossing in straight)
+    return crossings
+
+
+def red_light(rng: np.random.Generator, street: Street, duration_s: float) -> Crossing:
+    """The crossing at which the ego vehicle stands while others walk and drive by turns."""
+    hold = 2.0 * street.road_half_width / 1.7 + float(rng.uniform(0.5, 2.0))
+    crossing = Crossing(RED_LIGHT_M, False, hold)
+    start = -float(rng.uniform(1.0, 0.5 * hold))
+    while start < duration_s:
+        crossing.red.append((start, start + hold))
+        start += hold + float(rng.uniform(4.0, 7.0))
+    return crossing
+
+
 def place_vehicles(
     rng: np.random.Generator, street: Street, reach_m: float, lengths: FloatArray, shares: FloatArray
 ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
@@ -99,17 +132,28 @@ def place_vehicles(
 
 
 def simulate(
-    rng: np.random.Generator, road: Road, street: Street, duration_s: float, lengths: FloatArray, shares: FloatArray
+    rng: np.random.Generator,
+    road: Road,
+    street: Street,
+    route: Route,
+    duration_s: float,
+    lengths: FloatArray,
+    shares: FloatArray,
 ) -> Traffic:
     """Run the whole clip once; every frame then reads its instant from the result."""
     travel = duration_s * street.cruise_mps * 1.15
-    crossings = place_crossings(rng, street, travel)
+    crossings = crossings_on(rng, road, street, route, duration_s)
     s, lateral, direction, kind = place_vehicles(rng, street, 2.0 * travel + 260.0, lengths, shares)
     count = len(s)
     wanted = street.cruise_mps * rng.uniform(0.75, 1.1, count)
     wanted[0] = street.cruise_mps * 1.1
     length = lengths[kind]
     speed = np.minimum(wanted, street.cruise_mps * rng.uniform(0.6, 1.0, count))
+    limits = bend_limits(road, route, lateral, direction)
+    if route.corners:
+        speed = np.minimum(speed, limits(s))
+    if route.stands:
+        speed[0] = 0.0
     ahead = leaders(s, lateral, direction)
     steps = int(duration_s / TIME_STEP_S) + 3
     history_s, history_v = np.empty((steps, count)), np.empty((steps, count))
@@ -120,7 +164,7 @@ def simulate(
         leader = np.maximum(ahead, 0)
         gap = np.where(ahead >= 0, direction * (s[leader] - s) - (length + length[leader]) / 2, 500.0)
         closing = np.where(ahead >= 0, speed - speed[leader], 0.0)
-        acceleration = follow(speed, wanted_in_bends(road, s, wanted), gap, closing)
+        acceleration = follow(speed, np.minimum(wanted, limits(s)), gap, closing)
         for crossing in crossings:
             if crossing.is_red(time_s):
                 line = direction * (crossing.s - s) - STOP_DISTANCE_M - length / 2
@@ -129,6 +173,8 @@ def simulate(
                 acceleration = np.where(waits, np.minimum(acceleration, braking), acceleration)
         faster = np.maximum(speed + np.clip(acceleration, -7.0, ACCELERATION) * TIME_STEP_S, 0.0)
         faster[faster < 0.02] = 0.0
+        if route.stands:
+            faster[0] = 0.0
         mean_speed = (speed + faster) / 2.0
         # A lane right of the centreline is longer in a left bend: ds/dt = v / (1 + curvature * d).
         stretch = 1.0 + np.interp(s, road.arc, road.curvature) * lateral
@@ -155,10 +201,41 @@ def update_lights(crossings: tuple[Crossing, ...], time_s: float, ego_s: float) 
             crossing.red.append((time_s, time_s + crossing.hold_s))
 
 
-def wanted_in_bends(road: Road, s: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Desired speed limited to 2 m/s² of lateral acceleration."""
-    curvature = np.abs(np.interp(s, road.arc, road.curvature))
-    return np.minimum(wanted, np.sqrt(2.0 / np.maximum(curvature, 1e-4)))
+def bend_limits(
+    road: Road, route: Route, lateral: FloatArray, direction: IntArray
+) -> Callable[[FloatArray], FloatArray]:
+    """Speed limits of all vehicles in bends, m/s, as a function of their places s [vehicles]."""
+    if not route.corners:
+        return lambda s: cornering_speed(np.abs(np.interp(s, road.arc, road.curvature)), route.lateral_mps2)
+    lanes = [(np.flatnonzero(lateral == lane), float(lane)) for lane in np.unique(lateral)]
+    profiles = [
+        (members, braking_profile(road, route.lateral_mps2, lane, int(direction[members[0]])))
+        for members, lane in lanes
+    ]
+
+    def limits(s: FloatArray) -> FloatArray:
+        limit = np.empty_like(s)
+        for members, profile in profiles:
+            limit[members] = np.interp(s[members], road.arc, profile)
+        return limit
+
+    return limits
+
+
+def cornering_speed(curvature: FloatArray, lateral_mps2: float) -> FloatArray:
+    """Speed at which a path of this curvature, 1/m, takes the given lateral acceleration."""
+    speed: FloatArray = np.sqrt(lateral_mps2 / np.maximum(curvature, 1e-4))
+    return speed
+
+
+def braking_profile(road: Road, lateral_mps2: float, lateral: float, direction: int) -> FloatArray:
+    """Speed along one lane that leaves room to brake for every bend ahead, m/s at the points of the road."""
+    squared = cornering_speed(np.abs(road.curvature / (1.0 + road.curvature * lateral)), lateral_mps2)[::direction] ** 2
+    braking = 2.0 * CORNER_BRAKING * STEP_M * np.arange(len(squared))
+    # v(s)^2 <= v(t)^2 + 2 b (t - s) for every t ahead of s.
+    reachable = np.minimum.accumulate((squared + braking)[::-1])[::-1] - braking
+    profile: FloatArray = np.sqrt(reachable)[::direction]
+    return profile
 
 
 def follow(speed: FloatArray, wanted: FloatArray, gap: FloatArray, closing: FloatArray) -> FloatArray:

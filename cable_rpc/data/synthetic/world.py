@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cable_rpc.data.synthetic.actors import KIND_LENGTHS, KIND_SHARES, actor_pose
+from cable_rpc.data.synthetic.actors import CORNER_SHARES, KIND_LENGTHS, KIND_SHARES, actor_pose
 from cable_rpc.data.synthetic.camera import Camera
 from cable_rpc.data.synthetic.ground import Ground
 from cable_rpc.data.synthetic.groundpaint import GroundPainter
@@ -15,7 +15,8 @@ from cable_rpc.data.synthetic.occlusion import Occlusion, image_bounds
 from cable_rpc.data.synthetic.population import populate
 from cable_rpc.data.synthetic.raster import Target
 from cable_rpc.data.synthetic.render import Drawn, collect_truth
-from cable_rpc.data.synthetic.road import Pose, Road
+from cable_rpc.data.synthetic.road import Pose
+from cable_rpc.data.synthetic.route import Route, draw_road, street_on
 from cable_rpc.data.synthetic.scenario import draw_scenario
 from cable_rpc.data.synthetic.scenery import Prop, build_scenery
 from cable_rpc.data.synthetic.sensor import Sensor
@@ -36,22 +37,42 @@ class World:
     """Everything that is fixed by the seed; `render` is a pure function of time."""
 
     def __init__(
-        self, seed: int, camera: Camera, duration_s: float, noise: float, blur: float, vignette: float
+        self,
+        seed: int,
+        camera: Camera,
+        duration_s: float,
+        route: Route,
+        peopled: bool,
+        noise: float,
+        blur: float,
+        vignette: float,
     ) -> None:
         self.camera = camera
-        self.street, self.light = draw_scenario(seed)
+        street, self.light = draw_scenario(seed)
+        self.street = street_on(route, street)
         rng = np.random.default_rng([seed, 1])
         travel = duration_s * self.street.cruise_mps * 1.15
-        self.road = Road(rng, travel + 60.0, self.street.turn_rad, self.street.straight_m)
-        self.traffic = simulate(rng, self.road, self.street, duration_s, KIND_LENGTHS, KIND_SHARES)
+        self.road = draw_road(rng, route, self.street, travel + 60.0)
+        self.traffic = simulate(
+            rng,
+            self.road,
+            self.street,
+            route,
+            duration_s,
+            KIND_LENGTHS,
+            CORNER_SHARES if route.corners else KIND_SHARES,
+        )
         self.reach_m = float(self.traffic.s[-1, 0]) + VIEW_AHEAD_M + 10.0
-        self.actors = populate(rng, self.street, self.traffic, self.reach_m)
+        self.actors = populate(rng, self.street, self.road, self.traffic, self.reach_m)
         painter = GroundPainter(rng, self.road, self.street, self.light, self.traffic.crossings)
         self.ground = Ground(camera, painter)
         self.sky = Sky(rng, camera, self.light, SKYLINES_RAD[self.street.name])
         self.props: list[Prop] = build_scenery(
-            rng, self.road, self.street, self.light, self.traffic.crossings, self.reach_m
+            rng, self.road, self.street, route, self.light, self.traffic.crossings, self.reach_m
         )
+        # Only now: with and without traffic, the drive and the scenery are the same.
+        if not peopled:
+            self.actors = []
         self.anchors = np.array([[*prop.anchor, prop.shadow_reach, prop.s] for prop in self.props]).reshape(-1, 5).T
         self.spaces = [prop.space for prop in self.props]
         self.sensor = Sensor(seed, camera.width, camera.height, noise, blur, vignette)
