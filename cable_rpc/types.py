@@ -10,6 +10,7 @@ Conventions, everywhere in the package:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -18,6 +19,8 @@ import numpy.typing as npt
 
 Image = npt.NDArray[np.uint8]
 BoolMask = npt.NDArray[np.bool_]
+UncertaintyMap = npt.NDArray[np.uint8]
+"""uint8 [height, width], 0 = sure of the pixel's side of a mask, 255 = wholly undecided."""
 Float32Array = npt.NDArray[np.float32]
 Int32Array = npt.NDArray[np.int32]
 
@@ -47,6 +50,18 @@ class CameraIntrinsics:
     def scaled(self, factor_x: float, factor_y: float) -> CameraIntrinsics:
         """The same camera after resizing its image by the given factors."""
         return CameraIntrinsics(self.fx * factor_x, self.fy * factor_y, self.cx * factor_x, self.cy * factor_y)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraMount:
+    """Where a forward-looking camera without roll sits on its vehicle."""
+
+    height_m: float
+    """Optical centre above the road."""
+    pitch_down_rad: float = 0.0
+    """Tilt of the optical axis below the horizontal."""
+    forward_m: float = 0.0
+    """Optical centre ahead of the point whose motion `EgoMotion` tells (rear axle, GNSS antenna)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +134,7 @@ class Frame:
     ego: EgoMotion | None = None
     intrinsics: CameraIntrinsics | None = None
     truth: GroundTruth | None = None
+    mount: CameraMount | None = None
 
     @property
     def size_hw(self) -> tuple[int, int]:
@@ -159,25 +175,47 @@ class RoiMask:
         """The smallest block mask that covers a pixel mask (it only grows)."""
         height, width = mask.shape
         rows, columns = -(-height // block_size), -(-width // block_size)
-        padded = np.zeros((rows * block_size, columns * block_size), np.bool_)
-        padded[:height, :width] = mask
-        # Two contiguous reductions; one over both axes of a 4-D view is six times slower.
-        touched_rows = padded.reshape(rows, block_size, columns * block_size).any(axis=1)
-        blocks = touched_rows.reshape(rows, columns, block_size).any(axis=2)
-        return cls(np.asarray(blocks, np.bool_), block_size, height, width)
+        pixels = mask.view(np.uint8)
+        touched = np.zeros((rows, columns * block_size), np.uint8)
+        whole = height // block_size
+        bands = pixels[: whole * block_size].reshape(whole, block_size, width)
+        np.bitwise_or.reduce(bands, axis=1, out=touched[:whole, :width])
+        if whole < rows:
+            np.bitwise_or.reduce(pixels[whole * block_size :], axis=0, out=touched[whole, :width])
+        # Up to eight columns are compared at once, as one number.
+        unit = math.gcd(block_size, 8)
+        numbers = touched.view(f"u{unit}")
+        step = block_size // unit
+        blocks = numbers[:, ::step] != 0
+        for offset in range(1, step):
+            blocks |= numbers[:, offset::step] != 0
+        return cls(blocks, block_size, height, width)
 
     def pixels(self) -> BoolMask:
         """bool [height, width]."""
         if self.block_size == 1:
             return self.blocks
-        grown = self.blocks.repeat(self.block_size, axis=0).repeat(self.block_size, axis=1)
+        # Up to eight columns are written at once, as one number whose bytes are all 1.
+        unit = math.gcd(self.block_size, 8)
+        ones = np.array(int.from_bytes(b"\1" * unit, "little"), f"u{unit}")
+        band_rows = np.multiply(self.blocks, ones, order="C")
+        if self.block_size > unit:
+            band_rows = band_rows.repeat(self.block_size // unit, axis=1)
+        grown = band_rows.view(np.bool_).repeat(self.block_size, axis=0)
         pixels: BoolMask = grown[: self.height, : self.width]
         return pixels
 
     @property
     def coverage(self) -> float:
         """Share of the image's pixels inside the region, 0..1."""
-        return float(self.pixels().mean())
+        size = self.block_size
+        inside = int(np.count_nonzero(self.blocks)) * size * size
+        # What hangs over the border was counted too; the corner that hangs over both was taken off twice.
+        below, beside = -self.height % size, -self.width % size
+        inside -= int(np.count_nonzero(self.blocks[-1])) * below * size
+        inside -= int(np.count_nonzero(self.blocks[:, -1])) * beside * size
+        inside += int(self.blocks[-1, -1]) * below * beside
+        return inside / (self.height * self.width)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +230,8 @@ class Segmentation:
     """Visual tokens that entered the language model; 0 where there is none."""
     tokens_full: int = 0
     """Visual tokens that the full frame would have cost."""
+    uncertainty: UncertaintyMap | None = None
+    """[height, width]; None = not told."""
 
 
 @dataclass(frozen=True, slots=True)

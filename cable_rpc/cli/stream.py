@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -13,11 +14,13 @@ import typer
 from rich.console import Console
 
 from cable_rpc.cli.progress import RunProgress
+from cable_rpc.cli.roi_options import roi_config
 from cable_rpc.data.source import FrameSource, open_source
 from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.strategies import STRATEGIES
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
 from cable_rpc.study.summary_table import render_summary
-from cable_rpc.types import CameraIntrinsics
+from cable_rpc.types import CameraIntrinsics, CameraMount
 from cable_rpc.wire.convert import CODECS_BY_NAME
 
 console = Console(width=None if sys.stdout.isatty() else 100)
@@ -25,14 +28,33 @@ console = Console(width=None if sys.stdout.isatty() else 100)
 
 def stream(
     source: Annotated[
-        str, typer.Option(help="video:FILE, video:FOLDER of images, or synthetic:SEED.", metavar="SCHEME:...")
+        str,
+        typer.Option(
+            help="video:FILE, video:FOLDER of images, or synthetic:SEED[?route=turns&traffic=none].",
+            metavar="SCHEME:...",
+        ),
     ],
     target: Annotated[str, typer.Option(help="HOST:PORT of the server.", metavar="HOST:PORT")] = "127.0.0.1:50051",
     codec: Annotated[str, typer.Option(help="h264 | jpeg | webp.")] = "h264",
     quality: Annotated[
         int | None, typer.Option(help="JPEG/WebP quality 1..100 (75), H.264 CRF 0..51 (28; lower is better).")
     ] = None,
-    strategy: Annotated[str, typer.Option(help="cable (region of interest) | full-frame (baseline).")] = "cable",
+    strategy: Annotated[
+        str,
+        typer.Option(
+            help="What chooses the region: " + " | ".join(f"{name} ({text})" for name, text in STRATEGIES.items()) + "."
+        ),
+    ] = "cable",
+    mode: Annotated[
+        str, typer.Option(help="robust: made for the road | paper: the published method to the letter.")
+    ] = "robust",
+    roi: Annotated[
+        list[str] | None,
+        typer.Option(help="Change one switch of the mode, e.g. ego_model=flow; may be repeated.", metavar="KEY=VALUE"),
+    ] = None,
+    keyframes: Annotated[
+        str | None, typer.Option(help="What asks for whole frames: paper | periodic | budget | uncertainty.")
+    ] = None,
     pace: Annotated[
         str,
         typer.Option(
@@ -52,6 +74,10 @@ def stream(
     focal: Annotated[
         float | None, typer.Option(help="Focal length of the video's camera in pixels, for the ego-motion warp.")
     ] = None,
+    camera_height: Annotated[
+        float | None, typer.Option(help="Metres from the road to the video's camera, for the ground-plane warp.")
+    ] = None,
+    camera_pitch: Annotated[float, typer.Option(help="Degrees by which that camera looks below the horizontal.")] = 0.0,
     block_size: Annotated[int, typer.Option(help="Grid that the region is grown to; 1 = exact.", min=1)] = 8,
     prompt: Annotated[str, typer.Option(help="Sentence for an open-vocabulary segmenter.")] = "",
     min_score: Annotated[
@@ -72,8 +98,6 @@ def stream(
     """
     if pace not in {"lockstep", "realtime"}:
         raise ConfigurationError(f"--pace is '{pace}'; use lockstep or realtime")
-    if strategy not in {"cable", "full-frame"}:
-        raise ConfigurationError(f"--strategy is '{strategy}'; use cable or full-frame")
     if codec not in CODECS_BY_NAME:
         raise ConfigurationError(f"--codec is '{codec}'; use h264, jpeg or webp")
     frame_size = parse_size(size)
@@ -84,6 +108,7 @@ def stream(
         size=frame_size,
         intrinsics=centred_intrinsics(focal, source),
         fps=fps,
+        mount=camera_mount(camera_height, camera_pitch),
     )
     config = StreamRunConfig(
         target=target,
@@ -91,6 +116,7 @@ def stream(
         codec=codec,
         quality=quality,
         strategy=strategy,
+        roi=roi_config(mode, roi or (), keyframes),
         realtime=pace == "realtime",
         block_size=block_size,
         prompt=prompt,
@@ -135,6 +161,11 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if not (width.isdigit() and height.isdigit()):
         raise ConfigurationError(f"--size is '{text}'; write WIDTHxHEIGHT, e.g. 960x540")
     return int(width), int(height)
+
+
+def camera_mount(height_m: float | None, pitch_down_deg: float) -> CameraMount | None:
+    """Where the camera sits, if its height is known."""
+    return None if height_m is None else CameraMount(height_m, math.radians(pitch_down_deg))
 
 
 def centred_intrinsics(focal: float | None, source: str) -> CameraIntrinsics | None:

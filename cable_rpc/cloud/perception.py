@@ -9,6 +9,7 @@ import numpy as np
 
 from cable_rpc.cloud.backends import Detector, FrameContext, Segmenter
 from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
+from cable_rpc.errors import ModelError
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
 
 DEFAULT_PROMPT = "Please segment all vehicles, pedestrians and cyclists on the road."
@@ -78,8 +79,20 @@ class PerceptionModels:
 def _inside(
     segmenter: Segmenter, image: Image, roi: BoolMask | None, prompt: str, context: FrameContext
 ) -> Segmentation:
-    """M_k = F(I~_k, p) intersected with R_k."""
+    """M_k = F(I~_k, p) intersected with R_k; outside it nothing is known, so there is no uncertainty either.
+
+    Raises:
+        ModelError: if the segmenter's uncertainty is not uint8 of the picture's size.
+    """
+    whole = np.ones(image.shape[:2], np.bool_) if roi is None else roi
+    segmentation = segmenter.segment(image, whole, prompt, context)
+    uncertainty = segmentation.uncertainty
+    if uncertainty is not None and (uncertainty.shape != image.shape[:2] or uncertainty.dtype != np.uint8):
+        raise ModelError(
+            f"segmenter {segmenter.name} must state its uncertainty as uint8 {list(image.shape[:2])}, got "
+            f"{uncertainty.dtype} {list(uncertainty.shape)}"
+        )
     if roi is None:
-        return segmenter.segment(image, np.ones(image.shape[:2], np.bool_), prompt, context)
-    segmentation = segmenter.segment(image, roi, prompt, context)
-    return replace(segmentation, mask=segmentation.mask & roi)
+        return segmentation
+    known = None if uncertainty is None else np.where(roi, uncertainty, np.uint8(0))
+    return replace(segmentation, mask=segmentation.mask & roi, uncertainty=known)

@@ -20,16 +20,26 @@ class BoxSegmenter:
     device = "cpu"
 
     def segment(self, image: Image, roi: BoolMask, prompt: str, context: FrameContext) -> Segmentation:
-        """Union of the boxes; the confidence is the mean score, 1 where nothing was found."""
+        """Union of the boxes, each pixel as sure as the best of its boxes.
+
+        The confidence is the mean score, 1 where nothing was found; the uncertainty of a pixel 255 (1 - score), 0
+        outside the boxes.
+        """
         height, width = image.shape[:2]
         mask = np.zeros((height, width), np.bool_)
+        uncertainty = np.zeros((height, width), np.uint8)
+        scores = context.detections.scores
+        doubts = np.rint(255.0 * (1.0 - scores.astype(np.float64).clip(0.0, 1.0))).astype(np.uint8)
         boxes = context.detections.boxes_xyxy
         x_min, y_min = np.floor(boxes[:, :2]).clip(0).astype(int).T
         x_max, y_max = np.ceil(boxes[:, 2:]).clip(0).astype(int).T
-        for left, top, right, bottom in zip(x_min, y_min, x_max, y_max, strict=True):
-            mask[top:bottom, left:right] = True
-        scores = context.detections.scores
-        return Segmentation(mask, float(scores.mean()) if len(scores) else 1.0)
+        # The best box is painted last.
+        for box in np.argsort(scores, kind="stable"):
+            inside = np.s_[y_min[box] : y_max[box], x_min[box] : x_max[box]]
+            mask[inside] = True
+            uncertainty[inside] = doubts[box]
+        confidence = float(scores.mean()) if len(scores) else 1.0
+        return Segmentation(mask, confidence, uncertainty=uncertainty)
 
 
 @runtime_checkable

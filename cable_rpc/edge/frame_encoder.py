@@ -6,10 +6,10 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from cable_codecs import CodecParameters, EncodedFrame, create_encoder, fill_background
+from cable_codecs import CodecParameters, EncodedFrame, create_encoder, fill_blocks
 
 from cable_rpc.edge.capture import CapturedFrame
-from cable_rpc.edge.roi_tracker import RoiProposal
+from cable_rpc.edge.proposal import RoiProposal
 from cable_rpc.edge.strategy import RoiStrategy
 from cable_rpc.types import Image
 from cable_rpc.wire.convert import ego_to_message, region_to_message
@@ -64,10 +64,15 @@ class FrameEncoder:
         started_ns = time.monotonic_ns()
         proposal = self.strategy.propose(frame)
         proposed_ns = time.monotonic_ns()
-        whole = proposal.keyframe or bool(proposal.roi.blocks.all())
-        roi = None if whole else proposal.roi.pixels()
-        image = frame.image if roi is None else fill_background(frame.image, roi, "zero", out=self._canvas)
+        region = proposal.roi
+        whole = proposal.keyframe or bool(region.blocks.all())
+        image = (
+            frame.image
+            if whole
+            else fill_blocks(frame.image, region.blocks, region.block_size, "zero", out=self._canvas)
+        )
         filled_ns = time.monotonic_ns()
+        roi = None if whole else region.pixels()
         encoded = self._encoder.encode(image, roi, keyframe=force_keyframe)
         message = pb.VideoFrame(
             sequence=frame.index,

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import AsyncGenerator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from cable_rpc.edge.capture import Capture
@@ -28,6 +28,15 @@ class StreamedFrame:
     """When the mask had become the prior, monotonic clock."""
 
 
+@dataclass(frozen=True, slots=True)
+class _SentFrame:
+    """A frame whose answer is still to come."""
+
+    prepared: PreparedFrame
+    told: asyncio.Event = field(default_factory=asyncio.Event)
+    """The strategy knows what the frame cost, or sending failed."""
+
+
 class EdgeStreamer:
     """Streams one capture through one session.
 
@@ -40,7 +49,7 @@ class EdgeStreamer:
         self._capture = capture
         self._encoder = encoder
         self._client = client
-        self._sent: dict[int, PreparedFrame] = {}
+        self._sent: dict[int, _SentFrame] = {}
         self._finished = False
         # One worker for tracker and encoder: both hold state and must see frames and masks in one order.
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="edge")
@@ -84,20 +93,33 @@ class EdgeStreamer:
                 force_keyframe, self._client.keyframe_requested = self._client.keyframe_requested, False
                 prepare = partial(self._encoder.prepare, captured, force_keyframe=force_keyframe)
                 prepared = await loop.run_in_executor(self._worker, prepare)
-                self._sent[prepared.index] = prepared
-                await self._client.send(prepared.message)
+                self._sent[prepared.index] = sent = _SentFrame(prepared)
+                try:
+                    await self._client.send(prepared.message)
+                    tell = partial(self._encoder.strategy.sent, prepared.index, prepared.uplink_message_bytes)
+                    await loop.run_in_executor(self._worker, tell)
+                finally:
+                    sent.told.set()
         finally:
             self._finished = True
             await self._client.finish()
 
     async def _apply(self, answer: FrameAnswer) -> StreamedFrame:
-        prepared = self._sent.pop(answer.sequence, None)
-        if prepared is None:
+        sent = self._sent.pop(answer.sequence, None)
+        if sent is None:
             raise RemoteError(f"{self._client.target} answered frame {answer.sequence}, which is not open")
+        # A fast answer could overtake the sender's own bookkeeping.
+        await sent.told.wait()
         started_ns = time.monotonic_ns()
-        if answer.segmentation is not None:
-            await asyncio.get_running_loop().run_in_executor(
-                self._worker, self._encoder.strategy.update, answer.sequence, answer.segmentation.mask
+        segmentation = answer.segmentation
+        if segmentation is not None:
+            update = partial(
+                self._encoder.strategy.update,
+                answer.sequence,
+                segmentation.mask,
+                confidence=segmentation.confidence,
+                uncertainty=segmentation.uncertainty,
             )
+            await asyncio.get_running_loop().run_in_executor(self._worker, update)
         applied_ns = time.monotonic_ns()
-        return StreamedFrame(prepared, answer, applied_ns - started_ns, applied_ns)
+        return StreamedFrame(sent.prepared, answer, applied_ns - started_ns, applied_ns)

@@ -35,6 +35,8 @@ class FrameRecord:
 
     keyframe: bool = False
     """c_k: the frame was uploaded whole."""
+    keyframe_reason: str = ""
+    """What asked for it; empty on other frames."""
     idr: bool = False
     """The codec coded it without reference to earlier frames."""
     coverage: float | None = None

@@ -20,8 +20,7 @@ from cable_rpc.edge.capture import Capture
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder
 from cable_rpc.edge.roi_config import RoiConfig
-from cable_rpc.edge.roi_tracker import RoiTracker
-from cable_rpc.edge.strategy import FullFrame, RoiStrategy
+from cable_rpc.edge.strategy import FullFrame
 from cable_rpc.edge.streamer import EdgeStreamer, StreamedFrame
 from cable_rpc.study.evaluation import FrameEvidence, RunEvaluator, UplinkSpool, record_of
 from cable_rpc.study.run_record import (
@@ -32,6 +31,7 @@ from cable_rpc.study.run_record import (
     RunInfo,
     write_frames,
 )
+from cable_rpc.study.strategies import open_strategy
 from cable_rpc.study.summary import RunSummary, summarise, write_summary
 from cable_rpc.types import CameraIntrinsics, Frame
 
@@ -51,7 +51,7 @@ class StreamRunConfig:
     quality: int | None = None
     """JPEG/WebP 1..100, H.264 CRF; None = the codec's default."""
     strategy: str = "cable"
-    """"cable" or "full-frame"."""
+    """A name of `cable_rpc.study.strategies.STRATEGIES`."""
     realtime: bool = False
     """True: frames come at their own pace and are dropped when the loop is late. False: lock-step, one at a time."""
     block_size: int = 8
@@ -118,11 +118,7 @@ class StreamRun:
 
     async def _stream(self, spool: UplinkSpool) -> None:
         config = self._config
-        strategy: RoiStrategy = (
-            FullFrame(config.block_size)
-            if config.strategy == "full-frame"
-            else RoiTracker(config.roi, config.block_size)
-        )
+        strategy = open_strategy(config.strategy, config.roi, config.block_size)
         capture = Capture(self._source, realtime=config.realtime)
         with FrameCsvWriter(config.out / FRAMES_FILE) as csv:
             async with self._session(realtime=config.realtime) as client:

@@ -48,6 +48,8 @@ class FrameAnswer:
     segmentation: Segmentation | None
     mask_data: bytes
     """The mask as coded on the wire."""
+    uncertainty_data: bytes = b""
+    """The mask's uncertainty as coded on the wire; empty = not told."""
     rejection: str | None = None
     """Why the frame was not processed; None = it was."""
 
@@ -58,7 +60,7 @@ class FrameAnswer:
         """From the wire.
 
         Raises:
-            ProtocolError: if the mask does not belong to a frame of this size.
+            ProtocolError: if the mask does not belong to a frame of this size, or is damaged.
         """
         has_mask = result.HasField("mask")
         return cls(
@@ -69,6 +71,7 @@ class FrameAnswer:
             detections_from_messages(result.detections),
             mask_from_message(result.mask, height, width) if has_mask else None,
             result.mask.data if has_mask else b"",
+            result.mask.uncertainty if has_mask else b"",
         )
 
     @classmethod
@@ -83,5 +86,5 @@ class FrameAnswer:
             Detections.empty(),
             None,
             b"",
-            f"{reason}: {rejected.message}",
+            rejection=f"{reason}: {rejected.message}",
         )

@@ -10,6 +10,7 @@ from google.rpc import code_pb2, status_pb2
 
 from cable_rpc.errors import CableError, ProtocolError
 from cable_rpc.types import CameraIntrinsics, Detections, EgoMotion, RoiMask, Segmentation
+from cable_rpc.wire.uncertainty import decode_uncertainty, encode_uncertainty
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
 PROTOCOL_REVISION = 1
@@ -86,8 +87,9 @@ def detections_from_messages(messages: Iterable[pb.Detection]) -> Detections:
 
 
 def mask_to_message(segmentation: Segmentation) -> pb.Mask:
-    """Codes a segmenter's mask for the downlink."""
+    """Codes a segmenter's mask and uncertainty for the downlink."""
     height, width = segmentation.mask.shape
+    uncertainty = segmentation.uncertainty
     return pb.Mask(
         width=width,
         height=height,
@@ -95,14 +97,15 @@ def mask_to_message(segmentation: Segmentation) -> pb.Mask:
         confidence=segmentation.confidence,
         tokens_in=segmentation.tokens_in,
         tokens_full=segmentation.tokens_full,
+        uncertainty=b"" if uncertainty is None else encode_uncertainty(uncertainty),
     )
 
 
 def mask_from_message(message: pb.Mask, height: int, width: int) -> Segmentation:
-    """Decodes a mask that must have the frame's size.
+    """Decodes a mask that must have the frame's size; its uncertainty is None where the server tells none.
 
     Raises:
-        ProtocolError: if the size differs or the bitmap is damaged.
+        ProtocolError: if the size differs, or the bitmap or the uncertainty is damaged.
     """
     if (message.height, message.width) != (height, width):
         raise ProtocolError(f"the server sent a {message.width}x{message.height} mask for a {width}x{height} frame")
@@ -110,7 +113,8 @@ def mask_from_message(message: pb.Mask, height: int, width: int) -> Segmentation
         mask = decode_mask(message.data, height, width)
     except CodecError as error:
         raise ProtocolError(f"Mask.data is damaged: {error}") from error
-    return Segmentation(mask, message.confidence, message.tokens_in, message.tokens_full)
+    uncertainty = decode_uncertainty(message.uncertainty, height, width) if message.uncertainty else None
+    return Segmentation(mask, message.confidence, message.tokens_in, message.tokens_full, uncertainty)
 
 
 def ego_to_message(ego: EgoMotion) -> pb.EgoMotion:

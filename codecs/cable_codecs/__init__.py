@@ -5,7 +5,7 @@ Images are uint8 [height, width, 3] in BGR order; masks are bool [height, width]
 
 from cable_codecs.base import CodecParameters, Decoder, EncodedFrame, Encoder
 from cable_codecs.errors import CodecError, CodecUnavailableError
-from cable_codecs.fill import FillMode, fill_background
+from cable_codecs.fill import FillMode, fill_background, fill_blocks
 from cable_codecs.h264 import DEFAULT_CRF
 from cable_codecs.mask_codec import decode_mask, encode_mask
 from cable_codecs.quality import roi_psnr, roi_ssim
@@ -28,6 +28,7 @@ __all__ = [
     "decode_mask",
     "encode_mask",
     "fill_background",
+    "fill_blocks",
     "roi_psnr",
     "roi_ssim",
 ]

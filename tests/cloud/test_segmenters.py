@@ -33,6 +33,30 @@ def test_boxes_cover_every_pixel_they_touch_and_no_other(corners: list[tuple[flo
             assert found.mask[y, x] == touched
 
 
+scored_box = st.tuples(coordinate, coordinate, coordinate, coordinate, st.floats(0, 1, width=32))
+
+
+@given(st.lists(scored_box, max_size=4))
+def test_each_pixel_is_as_sure_as_the_best_of_its_boxes(rows: list[tuple[float, float, float, float, float]]) -> None:
+    boxes = [(min(a, c), min(b, d), max(a, c), max(b, d)) for a, b, c, d, _ in rows]
+    scores = [score for *_, score in rows]
+    detections = Detections(
+        np.array(boxes, np.float32).reshape(-1, 4), np.full(len(rows), 2, np.int32), np.array(scores, np.float32)
+    )
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    found = BoxSegmenter().segment(image, np.ones((HEIGHT, WIDTH), np.bool_), "", FrameContext(0, detections))
+    assert found.uncertainty is not None
+    assert found.uncertainty.dtype == np.uint8
+    for y in range(HEIGHT):
+        for x in range(WIDTH):
+            here = [
+                score
+                for (x0, y0, x1, y1), score in zip(boxes, scores, strict=True)
+                if np.floor(x0) <= x < np.ceil(x1) and np.floor(y0) <= y < np.ceil(y1)
+            ]
+            assert found.uncertainty[y, x] == (round(255 * (1 - max(here))) if here else 0)
+
+
 def test_oracle_answers_with_the_world_s_own_masks() -> None:
     oracle = load_segmenter("oracle:synthetic:3", BackendOptions())
     frame = SyntheticSource(SyntheticConfig(seed=3)).frame(2)
@@ -41,6 +65,7 @@ def test_oracle_answers_with_the_world_s_own_masks() -> None:
     roi = np.ones(frame.size_hw, np.bool_)
     answer = oracle.segment(frame.image, roi, "", FrameContext(2, Detections.empty()))
     assert np.array_equal(answer.mask, frame.truth.instance_mask > 0)
+    assert answer.uncertainty is None
     with pytest.raises(FrameError, match="same source and size"):
         oracle.segment(frame.image[:100], roi[:100], "", FrameContext(2, Detections.empty()))
 

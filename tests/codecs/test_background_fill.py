@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cable_codecs import CodecError, fill_background
+from cable_codecs.fill import fill_blocks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -60,3 +61,41 @@ def test_wrong_arguments_are_named():
         fill_background(image, roi, "zero", out=np.zeros((4, 12, 3), np.uint8)[:, ::2])
     with pytest.raises(CodecError, match="memory"):
         fill_background(image, roi, "grey", out=image)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    size=st.tuples(st.integers(1, 50), st.integers(1, 50)),
+    block_size=st.one_of(st.sampled_from([4, 8, 16]), st.integers(1, 60)),
+    density=st.sampled_from([0.0, 0.2, 0.7, 1.0]),
+    mode=st.sampled_from(["zero", "grey", "mean"]),
+)
+def test_blocks_are_their_pixels(seed, size, block_size, density, mode):
+    rng = np.random.default_rng(seed)
+    height, width = size
+    image = rng.integers(0, 256, (height, width, 3), np.uint8)
+    blocks = rng.random((-(-height // block_size), -(-width // block_size))) < density
+    roi = np.kron(blocks, np.ones((block_size, block_size), bool))[:height, :width]
+    expected = literal_fill(image, roi, mode)
+    before = image.copy()
+    out = np.full_like(image, 77)
+    assert fill_blocks(image, blocks, block_size, mode, out=out) is out
+    assert np.array_equal(out, expected)
+    assert np.array_equal(image, before)
+    assert np.array_equal(fill_blocks(image, blocks, block_size, mode), expected)
+    assert np.array_equal(fill_blocks(image, np.asfortranarray(blocks), block_size, mode), expected)
+
+
+def test_blocks_that_do_not_fit_are_named():
+    image = np.zeros((20, 30, 3), np.uint8)
+    with pytest.raises(CodecError, match=r"30x20.*\[3, 4\]"):
+        fill_blocks(image, np.ones((3, 3), bool), 8, "zero")
+    with pytest.raises(CodecError, match="bool"):
+        fill_blocks(image, np.ones((3, 4), np.uint8), 8, "zero")
+    with pytest.raises(CodecError, match="block_size"):
+        fill_blocks(image, np.ones((3, 4), bool), 0, "zero")
+    with pytest.raises(CodecError, match="zero, grey, mean"):
+        fill_blocks(image, np.ones((3, 4), bool), 8, "pink")
+    with pytest.raises(CodecError, match="memory"):
+        fill_blocks(image, np.ones((3, 4), bool), 8, "zero", out=image)

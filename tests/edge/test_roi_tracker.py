@@ -72,7 +72,7 @@ def test_lock_step_is_algorithm_1(seed):
     parameters = {**reference.PAPER, "b_0": base}
     if seed % 3 == 2:
         parameters.update(w_s=5, tau_min=Fraction(12, 100), h_min=Fraction(1, 4))
-    config = RoiConfig(
+    config = RoiConfig.paper(
         dilation_base_px=base,
         smoothing_window_columns=parameters["w_s"],
         min_coverage=float(parameters["tau_min"]),
@@ -122,7 +122,7 @@ def test_any_size_mask_and_motion(size, block_size, base, quarters, yaw, seed):
     def cloud(k, region):
         return masks[k] if region is None else masks[k] & region
 
-    tracker = RoiTracker(RoiConfig(dilation_base_px=base), block_size)
+    tracker = RoiTracker(RoiConfig.paper(dilation_base_px=base), block_size)
     tracker.propose(frame(0, greys[0], egos[0]))
     tracker.update(0, masks[0])
     for k, keyframe, region, _, _ in reference.algorithm1(greys, egos, FX, 0.125, cloud, parameters):
@@ -139,7 +139,7 @@ def test_any_size_mask_and_motion(size, block_size, base, quarters, yaw, seed):
 
 @pytest.mark.parametrize("ego", [EgoMotion(1e300, 1e300, 1e300), EgoMotion(0.0, 1e302), EgoMotion(0.0, -1e200)])
 def test_absurd_motion_only_loses_the_mask(ego):
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     tracker.propose(frame(0))
     tracker.update(0, box(10, 10, 20, 40))
     for k in range(1, 4):
@@ -164,7 +164,7 @@ def test_sequences_exercise_both_kinds_of_frame():
 
 
 def test_empty_scene_is_sent_whole_for_ever():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     nothing = np.zeros((HEIGHT, WIDTH), np.bool_)
     keyframes = []
     for k in range(102):
@@ -177,7 +177,7 @@ def test_empty_scene_is_sent_whole_for_ever():
 
 def test_newcomer_from_the_side_is_missed_until_a_refresh():
     size = (120, 640)
-    tracker = RoiTracker(block_size=1)
+    tracker = RoiTracker(RoiConfig.paper(), block_size=1)
     known = box(50, 60, 40, 80, size)
     for k in range(8):
         newcomer = box(50, 640 - 30 * k, 40, 60, size)
@@ -200,7 +200,7 @@ def test_late_answers_on_a_translating_scene(delay):
     rng = np.random.default_rng(delay)
     texture = rng.integers(0, 256, (96, 512)).astype(np.uint8)
     ego = EgoMotion(4.0, -shift * 4.0 / FX, yaw_rate_radps=0.01)
-    config = RoiConfig(stale_after_s=None)
+    config = RoiConfig.paper(stale_after_s=None)
     tracker = RoiTracker(config, block_size=1)
     answers = {}
     for k in range(25):
@@ -230,7 +230,7 @@ def test_late_answers_on_a_translating_scene(delay):
 def test_prior_is_judged_at_the_masks_own_frame():
     """Two frames late, the actor has left the prior's place; only the warp to its own frame agrees."""
     size = (96, 256)
-    tracker = RoiTracker(RoiConfig(stale_after_s=None), block_size=1)
+    tracker = RoiTracker(RoiConfig.paper(stale_after_s=None), block_size=1)
     still = box(40, 30, 20, 30, size)
     moved = box(40, 150, 20, 30, size)
     tracker.propose(frame(0, size=size))
@@ -246,7 +246,7 @@ def test_prior_is_judged_at_the_masks_own_frame():
 
 
 def test_older_doubled_and_unknown_answers_are_counted_and_ignored():
-    tracker = RoiTracker(block_size=1)
+    tracker = RoiTracker(RoiConfig.paper(), block_size=1)
     for k in range(4):
         tracker.propose(frame(k))
     tracker.update(2, box(10, 10))
@@ -260,7 +260,7 @@ def test_older_doubled_and_unknown_answers_are_counted_and_ignored():
 
 
 def test_history_is_bounded():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     for k in range(HISTORY_FRAMES + 10):
         tracker.propose(frame(k))
     tracker.update(5, box(0, 0))
@@ -270,7 +270,7 @@ def test_history_is_bounded():
 
 
 def test_silence_brings_one_keyframe_per_period():
-    tracker = RoiTracker(RoiConfig(stale_after_s=1.0))
+    tracker = RoiTracker(RoiConfig.paper(stale_after_s=1.0))
     tracker.propose(frame(0))
     tracker.update(0, box(10, 10, 20, 40))
     keyframes = [k for k in range(1, 30) if tracker.propose(frame(k)).keyframe]
@@ -279,7 +279,7 @@ def test_silence_brings_one_keyframe_per_period():
 
 
 def test_slow_lock_step_is_not_stale():
-    tracker = RoiTracker(RoiConfig(stale_after_s=1.0))
+    tracker = RoiTracker(RoiConfig.paper(stale_after_s=1.0))
     for k in range(6):
         proposal = tracker.propose(frame(k, capture_time_ns=k * 3_000_000_000))
         assert proposal.keyframe == (k == 0)
@@ -287,7 +287,7 @@ def test_slow_lock_step_is_not_stale():
 
 
 def test_requested_keyframe_comes_once():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     tracker.propose(frame(0))
     tracker.update(0, box(10, 10, 20, 40))
     tracker.request_keyframe()
@@ -300,7 +300,7 @@ def test_requested_keyframe_comes_once():
 
 
 def test_what_travels_is_the_region_grown_to_blocks():
-    fine, coarse = RoiTracker(block_size=1), RoiTracker(block_size=16)
+    fine, coarse = RoiTracker(RoiConfig.paper(), block_size=1), RoiTracker(RoiConfig.paper(), block_size=16)
     for tracker in (fine, coarse):
         tracker.propose(frame(0))
         tracker.update(0, box(13, 21))
@@ -310,7 +310,7 @@ def test_what_travels_is_the_region_grown_to_blocks():
 
 
 def test_standstill_with_lateral_noise_loses_the_mask():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     tracker.propose(frame(0))
     tracker.update(0, box(10, 10, 20, 40))
     proposal = tracker.propose(frame(1, ego=EgoMotion(0.0, 0.02)))
@@ -320,7 +320,7 @@ def test_standstill_with_lateral_noise_loses_the_mask():
 
 
 def test_reset_starts_a_new_stream():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     tracker.propose(frame(5))
     tracker.update(5, box(10, 10))
     tracker.reset()
@@ -328,7 +328,7 @@ def test_reset_starts_a_new_stream():
 
 
 def test_mask_belongs_to_the_tracker():
-    tracker = RoiTracker(block_size=1)
+    tracker = RoiTracker(RoiConfig.paper(), block_size=1)
     mask = box(10, 10, 20, 40)
     tracker.propose(frame(0))
     tracker.update(0, mask)
@@ -337,7 +337,7 @@ def test_mask_belongs_to_the_tracker():
 
 
 def test_bad_input_is_refused_and_changes_nothing():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     tracker.propose(frame(3))
     tracker.update(3, box(10, 10, 20, 40))
     with pytest.raises(ConfigurationError, match="32x20"):
@@ -354,13 +354,13 @@ def test_bad_input_is_refused_and_changes_nothing():
     with pytest.raises(FrameError, match="mask of frame 4"):
         tracker.update(4, np.zeros((3, 3), np.bool_))
     with pytest.raises(ConfigurationError, match="block_size"):
-        RoiTracker(block_size=0)
+        RoiTracker(RoiConfig.paper(), block_size=0)
 
 
 def test_stages_are_timed():
-    tracker = RoiTracker()
+    tracker = RoiTracker(RoiConfig.paper())
     tracker.propose(frame(0))
     tracker.update(0, box(10, 10))
     stages = tracker.propose(frame(1)).timings.stages_ns
-    assert set(stages) == {"warp", "residual", "dilate", "fuse", "corridor"}
+    assert set(stages) == {"grey", "warp", "residual", "dilate", "corridor", "entry", "decide"}
     assert all(duration > 0 for duration in stages.values())

@@ -300,20 +300,22 @@ class Detection(_message.Message):
     def __init__(self, x_min: _Optional[float] = ..., y_min: _Optional[float] = ..., x_max: _Optional[float] = ..., y_max: _Optional[float] = ..., class_id: _Optional[int] = ..., score: _Optional[float] = ...) -> None: ...
 
 class Mask(_message.Message):
-    __slots__ = ("width", "height", "data", "confidence", "tokens_in", "tokens_full")
+    __slots__ = ("width", "height", "data", "confidence", "tokens_in", "tokens_full", "uncertainty")
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
     CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     TOKENS_IN_FIELD_NUMBER: _ClassVar[int]
     TOKENS_FULL_FIELD_NUMBER: _ClassVar[int]
+    UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
     width: int
     height: int
     data: bytes
     confidence: float
     tokens_in: int
     tokens_full: int
-    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., data: _Optional[bytes] = ..., confidence: _Optional[float] = ..., tokens_in: _Optional[int] = ..., tokens_full: _Optional[int] = ...) -> None: ...
+    uncertainty: bytes
+    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., data: _Optional[bytes] = ..., confidence: _Optional[float] = ..., tokens_in: _Optional[int] = ..., tokens_full: _Optional[int] = ..., uncertainty: _Optional[bytes] = ...) -> None: ...
 
 class FrameRejected(_message.Message):
     __slots__ = ("sequence", "reason", "message", "timing")

@@ -1,4 +1,4 @@
-"""Each step of the region-of-interest method against literal references and hand-made cases."""
+"""The steps of the paper's method: its reference checks, against literal references and hand-made cases."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ import algorithm1_reference as reference
 
 from cable_rpc.edge.corridor import corridor, corridor_curves, moving_average
 from cable_rpc.edge.dilation import dilate, dilation_radius, ellipse_rectangles, fuse
-from cable_rpc.edge.ego_motion import EgoStep, ego_step, translation_homography, warp_frame, warp_mask
 from cable_rpc.edge.refresh import mask_iou, refresh_flag
 from cable_rpc.edge.residual import grey, residual_motion
 from cable_rpc.edge.roi_config import RoiConfig
+from cable_rpc.edge.view_warp import ViewWarp, warp_frame
 from cable_rpc.errors import ConfigurationError
-from cable_rpc.types import CameraIntrinsics, EgoMotion
 
 SIZES = st.tuples(st.integers(1, 24), st.integers(1, 40))
 MASKS = SIZES.flatmap(lambda size: hnp.arrays(np.bool_, size))
@@ -43,7 +42,7 @@ def translation(shift):
 
 
 def test_defaults_are_the_papers():
-    config = RoiConfig()
+    config = RoiConfig.paper()
     assert config.mode == "paper"
     assert (config.residual_threshold_levels, config.min_coverage, config.min_iou) == (25, 0.02, 0.3)
     assert (config.smoothing_window_columns, config.top_margin, config.bottom_margin) == (15, 0.10, 0.15)
@@ -54,7 +53,8 @@ def test_defaults_are_the_papers():
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("mode", "bold"),
+        ("ego_model", "bold"),
+        ("keyframe_policy", "often"),
         ("min_iou", 1.5),
         ("smoothing_window_columns", 14),
         ("dilation_base_px", -1.0),
@@ -65,96 +65,7 @@ def test_defaults_are_the_papers():
 )
 def test_unusable_setting_is_named(field, value):
     with pytest.raises(ConfigurationError, match=field):
-        RoiConfig(**{field: value})
-
-
-# --- ego-motion ---------------------------------------------------------------------------------------
-
-
-def test_homography_formula_does_not_depend_on_frame_rate():
-    ego = EgoMotion(speed_mps=10.0, lateral_mps=0.1)
-    for dt in (0.05, 0.1, 0.3):
-        assert translation_homography(ego, dt, 1266.0, 1e-6) == pytest.approx(translation(-12.66))
-
-
-def test_driving_left_moves_the_scene_right():
-    left = EgoMotion(speed_mps=10.0, lateral_mps=-0.5)
-    homography = translation_homography(left, 0.1, 100.0, 1e-6)
-    mask = np.zeros((10, 40), np.bool_)
-    mask[4:6, 10:12] = True
-    assert np.flatnonzero(warp_mask(mask, homography).any(axis=0)).tolist() == [15, 16]
-
-
-@pytest.mark.parametrize("known", [(None, 100.0), (EgoMotion(10.0, 1.0), None)])
-def test_unknown_ego_or_camera_is_identity(known):
-    ego, fx = known
-    assert np.array_equal(translation_homography(ego, 0.1, fx, 1e-6), np.eye(3))
-
-
-def test_paper_blows_up_at_standstill():
-    shift = translation_homography(EgoMotion(0.0, 0.02), 0.1, 1000.0, 1e-6)[0, 2]
-    assert shift == pytest.approx(-2e6)
-    assert not warp_mask(np.ones((5, 9), np.bool_), translation(shift)).any()
-
-
-@pytest.mark.parametrize("shift", [np.inf, -np.inf, np.nan, 1e300, -1e300, 41.0, -41.0])
-def test_shift_beyond_the_frame_empties_it(shift):
-    mask = np.ones((12, 40), np.bool_)
-    image = np.full((12, 40), 99, np.uint8)
-    assert not warp_mask(mask, translation(shift)).any()
-    assert not warp_frame(image, translation(shift))[1].any()
-
-
-def test_overflowing_steps_compose():
-    step = EgoStep(translation(1.7e308)).then(EgoStep(translation(1.7e308)))
-    assert not warp_mask(np.ones((4, 4), np.bool_), step.homography).any()
-
-
-@given(mask=MASKS, quarter=st.integers(-200, 200))
-def test_warp_mask_is_nearest(mask, quarter):
-    assert np.array_equal(warp_mask(mask, translation(quarter / 4)), reference.warp_mask(mask, quarter / 4))
-
-
-@given(size=SIZES, quarter=st.integers(-200, 200), seed=st.integers(0, 999))
-def test_warp_frame_is_bilinear(size, quarter, seed):
-    image = (4 * np.random.default_rng(seed).integers(0, 64, size)).astype(np.uint8)
-    warped, valid = warp_frame(image, translation(quarter / 4))
-    valid = np.ones(size, np.bool_) if valid is None else valid
-    expected, expected_valid = reference.warp_grey(image, quarter / 4)
-    assert np.array_equal(valid, expected_valid)
-    assert np.array_equal(warped[valid], expected[valid])
-
-
-def test_identity_copies_nothing():
-    mask, image = np.ones((4, 4), np.bool_), np.ones((4, 4), np.uint8)
-    assert warp_mask(mask, np.eye(3)) is mask
-    assert warp_frame(image, np.eye(3)) == (image, None)
-
-
-def test_general_homography_maps_forward():
-    zoom = np.array([[2.0, 0, -20], [0, 2.0, -10], [0, 0, 1]])
-    mask = np.zeros((20, 40), np.bool_)
-    mask[8:12, 18:22] = True
-    grown = warp_mask(mask, zoom)
-    rows, columns = np.nonzero(grown)
-    # Outermost source pixels land on rows 6 and 12 and columns 16 and 22; a pixel is two wide now.
-    assert (abs(rows.min() - 6) <= 1, abs(rows.max() - 12) <= 1) == (True, True)
-    assert (abs(columns.min() - 16) <= 1, abs(columns.max() - 22) <= 1) == (True, True)
-    ramp = np.tile(np.arange(0, 200, 5, dtype=np.uint8), (20, 1))
-    warped, valid = warp_frame(ramp, zoom)
-    assert valid.all()
-    assert abs(int(warped[10, 20]) - 100) <= 1
-    assert abs(int(warped[10, 22]) - 105) <= 1
-
-
-def test_step_measures_metres_and_degrees():
-    ego = EgoMotion(3.0, 4.0, yaw_rate_radps=-np.pi / 18)
-    step = ego_step(ego, CameraIntrinsics(100, 100, 0, 0), 0.1, RoiConfig())
-    assert step.displacement_m == pytest.approx(0.5)
-    assert step.yaw_change_deg == pytest.approx(1.0)
-    both = step.then(step)
-    assert (both.displacement_m, both.yaw_change_deg) == (pytest.approx(1.0), pytest.approx(2.0))
-    assert both.homography[0, 2] == pytest.approx(2 * step.homography[0, 2])
+        RoiConfig.paper(**{field: value})
 
 
 # --- residual -----------------------------------------------------------------------------------------
@@ -174,7 +85,7 @@ def test_threshold_is_strict_and_symmetric():
 
 def test_no_motion_where_the_warp_is_undefined():
     still = np.full((6, 30), 200, np.uint8)
-    warped, valid = warp_frame(still, translation(7.5))
+    warped, valid = warp_frame(still, ViewWarp(translation(7.5)))
     assert not residual_motion(still, warped, valid, 25).any()
     assert residual_motion(still, warped, None, 25)[:, :7].all()
 
@@ -183,7 +94,7 @@ def test_no_motion_where_the_warp_is_undefined():
 
 
 def test_one_degree_adds_twenty_pixels():
-    config = RoiConfig()
+    config = RoiConfig.paper()
     assert dilation_radius(config, 0.0, 0.0) == 8
     assert dilation_radius(config, 0.0, 1.0) == 28
     assert dilation_radius(config, 0.0, -1.0) == 28
@@ -240,7 +151,7 @@ def test_fusion_formula(seed):
 def test_corridor_on_the_papers_blob():
     raw = np.zeros((720, 1280), np.bool_)
     raw[300:341, 600:640] = True
-    band = corridor(raw, RoiConfig())
+    band = corridor(raw, RoiConfig.paper())
     rows, columns = np.nonzero(band)
     assert (columns.min(), columns.max()) == (600, 639)
     assert (rows.min(), rows.max()) == (270, 397)
@@ -251,7 +162,7 @@ def test_two_blobs_make_one_band():
     raw = np.zeros((720, 1280), np.bool_)
     raw[300:341, 200:240] = True
     raw[350:391, 540:580] = True
-    band = corridor(raw, RoiConfig())
+    band = corridor(raw, RoiConfig.paper())
     assert band.any(axis=0)[200:580].all()
     assert not band.any(axis=0)[:200].any()
     assert not band.any(axis=0)[580:].any()
@@ -261,7 +172,7 @@ def test_smoothing_does_not_bend_at_the_ends():
     assert moving_average(np.full(40, 300.0), 15) == pytest.approx(np.full(40, 300.0))
     raw = np.zeros((400, 500), np.bool_)
     raw[200:221, :] = True
-    _, first, last = corridor_curves(raw, RoiConfig())
+    _, first, last = corridor_curves(raw, RoiConfig.paper())
     assert len(set(first)) == len(set(last)) == 1
 
 
@@ -269,7 +180,7 @@ def test_smoothing_does_not_bend_at_the_ends():
 def test_least_height_stays_inside(row):
     raw = np.zeros((100, 40), np.bool_)
     raw[row, 10:30] = True
-    config = RoiConfig(top_margin=0, bottom_margin=0, min_height_fraction=0.2)
+    config = RoiConfig.paper(top_margin=0, bottom_margin=0, min_height_fraction=0.2)
     rows = np.nonzero(corridor(raw, config))[0]
     assert rows.max() - rows.min() == 20
     centre = min(max(row, 10), 89)
@@ -279,11 +190,11 @@ def test_least_height_stays_inside(row):
 def test_least_height_of_the_whole_frame():
     raw = np.zeros((30, 8), np.bool_)
     raw[29, 2:5] = True
-    assert corridor(raw, RoiConfig(min_height_fraction=1.0))[:, 2:5].all()
+    assert corridor(raw, RoiConfig.paper(min_height_fraction=1.0))[:, 2:5].all()
 
 
 def test_empty_stays_empty():
-    assert not corridor(np.zeros((30, 40), np.bool_), RoiConfig()).any()
+    assert not corridor(np.zeros((30, 40), np.bool_), RoiConfig.paper()).any()
 
 
 @given(
@@ -294,7 +205,7 @@ def test_empty_stays_empty():
 @settings(max_examples=150, deadline=None)
 def test_corridor_equals_exact_fractions(mask, window, margins):
     top, bottom, least = (Fraction(value, 100) for value in margins)
-    config = RoiConfig(
+    config = RoiConfig.paper(
         smoothing_window_columns=window,
         top_margin=float(top),
         bottom_margin=float(bottom),
@@ -310,7 +221,7 @@ def test_corridor_equals_exact_fractions(mask, window, margins):
 
 
 def test_refresh_flag_is_the_equation():
-    config = RoiConfig()
+    config = RoiConfig.paper()
     assert not refresh_flag(0.02, 0.3, config)
     assert refresh_flag(0.0199, 1.0, config)
     assert refresh_flag(0.5, 0.299, config)
