@@ -12,6 +12,7 @@ from cable_codecs import CodecError
 
 import cable_rpc
 from cable_rpc.cli.demo import demo
+from cable_rpc.cli.inspect import inspect
 from cable_rpc.cli.serve import serve
 from cable_rpc.cli.stream import stream
 from cable_rpc.errors import CableError
@@ -27,6 +28,7 @@ app = typer.Typer(
 app.command()(serve)
 app.command()(stream)
 app.command()(demo)
+app.command()(inspect)
 
 
 def _version(wanted: bool) -> None:
