@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
 from cable_rpc.edge.view_warp import MAX_MAGNIFICATION, ViewWarp, warp_mask
 from cable_rpc.types import BoolMask
-
-LABELS_16_BIT = 60_000
 
 
 def warp_actors(mask: BoolMask, warp: ViewWarp) -> BoolMask:
@@ -32,27 +31,41 @@ def warp_actors(mask: BoolMask, warp: ViewWarp) -> BoolMask:
     warped = np.zeros_like(mask)
     if not (np.isfinite(warp.ground).all() and np.isfinite(warp.far).all()):
         return warped
-    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
-    if width == 0:
+    found = list(pieces(mask))
+    if not found:
         return warped
-    box = mask[top : top + height, left : left + width].view(np.uint8)
-    # An 8-connected piece takes a 2x2 cell at least, so 16 bits number those of any small picture, in half the time.
-    label_type = cv2.CV_16U if box.size < 4 * LABELS_16_BIT else cv2.CV_32S
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(box, connectivity=8, ltype=label_type)
-    for label in range(1, count):
-        x, y, width, height, _ = boxes[label].tolist()
-        x, y = x + left, y + top
-        # The piece's lower edge, where it touches the road; the turn of the view differs little across a piece.
-        contact = np.array([x + (width - 1) / 2, y + height - 0.5, 1.0])
-        homography = warp.ground if contact[1] > warp.horizon_row else warp.far
-        with np.errstate(all="ignore"):
-            to_x, to_y, depth_ratio = homography @ contact
-            scale = float(1 / depth_ratio)
-            to_x, to_y = float(to_x * scale), float(to_y * scale)
-        if 0 < scale <= MAX_MAGNIFICATION and math.isfinite(to_x) and math.isfinite(to_y):
-            piece = labels[y - top : y - top + height, x - left : x - left + width] == label
-            place(piece, (x, y), scale, (to_x - scale * contact[0], to_y - scale * contact[1]), warped)
+    boxes = np.array([box for box, _ in found])
+    # A piece's lower edge, where it touches the road; the turn of the view differs little across a piece.
+    contacts = np.ones((len(found), 3))
+    contacts[:, 0] = boxes[:, 0] + (boxes[:, 2] - 1) / 2
+    contacts[:, 1] = boxes[:, 1] + boxes[:, 3] - 0.5
+    on_ground = contacts[:, 1, None] > warp.horizon_row
+    with np.errstate(all="ignore"):
+        moved = np.where(on_ground, contacts @ warp.ground.T, contacts @ warp.far.T)
+        scales = 1 / moved[:, 2]
+        offsets = (moved[:, :2] - contacts[:, :2]) * scales[:, None]
+    usable = (scales > 0) & (scales <= MAX_MAGNIFICATION) & np.isfinite(offsets).all(axis=1)
+    for number in np.flatnonzero(usable).tolist():
+        (x, y, _, _), piece = found[number]
+        place(piece, (x, y), float(scales[number]), (float(offsets[number, 0]), float(offsets[number, 1])), warped)
     return warped
+
+
+def pieces(mask: BoolMask) -> Iterator[tuple[tuple[int, int, int, int], BoolMask]]:
+    """The 8-connected pieces of a mask: (x, y, width, height) and bool [height, width] of each."""
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    box = mask[top : top + height, left : left + width].view(np.uint8)
+    if width == 0:
+        return
+    # Outlines tell the boxes at a fifth of the cost of OpenCV's statistics.
+    _, labels = cv2.connectedComponentsWithAlgorithm(box, 8, cv2.CV_32S, cv2.CCL_SPAGHETTI)
+    outlines, hierarchy = cv2.findContours(box, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    for outline, (*_, parent) in zip(outlines, hierarchy[0], strict=True):
+        if parent >= 0:
+            continue  # a hole
+        x, y, columns, rows = cv2.boundingRect(outline)
+        label = labels[outline[0, 0, 1], outline[0, 0, 0]]
+        yield (left + x, top + y, columns, rows), labels[y : y + rows, x : x + columns] == label
 
 
 def place(

@@ -15,7 +15,7 @@ from cable_rpc.edge.proposal import RoiSteps
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.edge.stage_clock import StageClock
 from cable_rpc.edge.view_change import ViewChange
-from cable_rpc.edge.view_warp import warp_mask
+from cable_rpc.edge.view_warp import ViewWarp, warp_mask
 from cable_rpc.types import BoolMask, Frame, RoiMask
 
 NEW_VIEW_LIMIT_SHARE = 0.25
@@ -62,6 +62,18 @@ def moved_mask(mask: BoolMask, step: EgoStep, config: RoiConfig) -> BoolMask:
     return warp_actors(mask, warp) if config.upright_actors else warp_mask(mask, warp)
 
 
+def with_moving_actors(standing: BoolMask, prior: Prior, config: RoiConfig) -> BoolMask:
+    """The prior's support where its actors stand, and where they would be had they driven along with the vehicle.
+
+    Seen from a vehicle, who drives along keeps his place but for the camera's turn.
+    """
+    warp = prior.step.warp
+    if warp.far is None:
+        return standing
+    along = moved_mask(prior.support, EgoStep(ViewWarp(warp.far)), config)
+    return standing | along
+
+
 def region_blocks(cells: BoolMask, scale: int, size_hw: tuple[int, int], block_size: int) -> RoiMask:
     """The smallest block mask that covers a region.
 
@@ -98,6 +110,8 @@ class RegionPredictor:
         config, scale = self._config, self._config.analysis_scale
         warped_prior = moved_mask(prior.mask, prior.step, config)
         support = warped_prior if prior.support is prior.mask else moved_mask(prior.support, prior.step, config)
+        if config.moving_actors:
+            support = with_moving_actors(support, prior, config)
         clock.lap("warp")
         fx = None if frame.intrinsics is None else frame.intrinsics.fx
         radius_px = dilation_radius(

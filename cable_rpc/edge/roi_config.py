@@ -46,6 +46,9 @@ class RoiConfig:
     upright_actors: bool = True
     """Under ``ground_plane`` each piece of the mask keeps its shape and follows the road at its foot, rather than
     being spread over the road behind it."""
+    moving_actors: bool = True
+    """Under ``ground_plane`` an actor may stand or drive along; where it would be in either case belongs to the
+    prior."""
     mask_warp_border: bool = True
     """No residual motion where the warped frame is undefined."""
     # Residual motion
@@ -193,6 +196,7 @@ PAPER = RoiConfig(
     epsilon_m=1e-6,
     max_shift_share=0.0,
     upright_actors=False,
+    moving_actors=False,
     keep_unseen=False,
     residual_noise_factor=0.0,
     residual_opening=False,

@@ -41,7 +41,7 @@ class ProposedFrame:
     prior: PackedMask | None
     """That prior, warped to the frame."""
     region: PackedMask | None
-    """R_k, also where the frame was sent whole."""
+    """R_k, also where the frame was sent whole; None where nothing will ask for it."""
 
 
 def unpacked(packed: PackedMask, shape: tuple[int, ...]) -> BoolMask:
@@ -249,13 +249,14 @@ class RoiTracker:
         self._answer = None
         self._last_time_ns = frame.capture_time_ns
         self._last_region = region
+        needs_region = region is not None and (keyframe or self.config.keep_unseen)
         self._history[frame.index] = ProposedFrame(
             step,
             frame.capture_time_ns,
             keyframe,
             None if prior is None else prior.index,
             None if region is None else np.packbits(region.warped_prior),
-            None if region is None else np.packbits(region.cells),
+            np.packbits(region.cells) if region is not None and needs_region else None,
         )
         if len(self._history) > HISTORY_FRAMES:
             self._history.popitem(last=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import algorithm1_reference as reference
 
-from cable_rpc.edge.actor_warp import warp_actors
+from cable_rpc.edge.actor_warp import pieces, warp_actors
 from cable_rpc.edge.ego_motion import ego_step
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.edge.view_warp import MAX_MAGNIFICATION, ViewWarp, warp_frame, warp_mask
@@ -214,3 +215,18 @@ def test_without_horizon_actors_move_with_the_picture():
 def test_empty_mask_stays_empty():
     assert not warp_actors(np.zeros((45, 80), np.bool_), road_warp(10.0, 0.1)).any()
     assert not warp_mask(np.zeros((45, 80), np.bool_), road_warp(10.0, 0.1)).any()
+
+
+@given(mask=hnp.arrays(np.bool_, st.tuples(st.integers(1, 20), st.integers(1, 24))))
+def test_pieces_are_the_connected_ones(mask):
+    """Also pieces inside the hole of another, against OpenCV's labels of the whole mask."""
+    count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
+    found = []
+    for (x, y, width, height), piece in pieces(mask):
+        whole = np.zeros_like(mask)
+        whole[y : y + height, x : x + width] = piece
+        assert piece.any(axis=0).all() or width > 1
+        found.append(whole)
+    assert len(found) == count - 1
+    for label in range(1, count):
+        assert sum(np.array_equal(whole, labels == label) for whole in found) == 1
