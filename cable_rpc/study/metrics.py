@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -179,8 +180,7 @@ def roi_overlap(truth_boxes: npt.ArrayLike, roi_pixels: BoolMask) -> Float64Arra
     x0, y0 = np.floor(clipped[:, :2]).astype(np.int64).T
     x1, y1 = np.ceil(clipped[:, 2:]).astype(np.int64).T
     empty = (clipped[:, 2] <= clipped[:, 0]) | (clipped[:, 3] <= clipped[:, 1])
-    integral = np.zeros((height + 1, width + 1), np.int64)
-    integral[1:, 1:] = roi_pixels.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
+    integral = cv2.integral(np.ascontiguousarray(roi_pixels).view(np.uint8), sdepth=cv2.CV_32S)
     inside = integral[y1, x1] - integral[y0, x1] - integral[y1, x0] + integral[y0, x0]
     area = (x1 - x0) * (y1 - y0)
     share: Float64Array = np.divide(inside, area, out=np.zeros(len(boxes)), where=~empty & (area > 0))
