@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
-from cable_codecs import CodecError, CodecParameters, Decoder, create_decoder, fill_background
+from cable_codecs import CodecError, CodecParameters, Decoder, create_decoder, fill_blocks
 
 from cable_rpc.errors import FrameError, ProtocolError
-from cable_rpc.types import BoolMask, Image
+from cable_rpc.types import BoolMask, Image, RoiMask
 from cable_rpc.wire.convert import codec_name, region_from_message
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
@@ -75,7 +75,7 @@ class StreamDecoder:
         Raises:
             FrameRejection: with the reason that the client is told.
         """
-        roi = self._region(frame)
+        region = self._region(frame)
         self._check_reference(frame)
         try:
             with self._in_use:
@@ -87,20 +87,20 @@ class StreamDecoder:
             ) from error
         self._lost = False
         self.last_good_sequence = frame.sequence
-        if roi is None:
+        if region is None:
             return DecodedFrame(image, None)
-        return DecodedFrame(fill_background(image, roi, "zero"), roi)
+        return DecodedFrame(fill_blocks(image, region.blocks, region.block_size, "zero"), region.pixels())
 
     def close(self) -> None:
         """Frees the codec, after a decode that is still running in another thread."""
         with self._in_use:
             self._decoder.close()
 
-    def _region(self, frame: pb.VideoFrame) -> BoolMask | None:
+    def _region(self, frame: pb.VideoFrame) -> RoiMask | None:
         if not frame.HasField("region"):
             return None
         try:
-            return region_from_message(frame.region, self._height, self._width).pixels()
+            return region_from_message(frame.region, self._height, self._width)
         except ProtocolError as error:
             self.mark_lost()
             raise FrameRejection(pb.REJECT_REASON_INVALID_REGION, f"frame {frame.sequence}: {error}") from error

@@ -93,7 +93,7 @@ class OpenLoop(WithoutFeedback):
             prior_index=prior.index,
             staleness=prior.staleness,
             dilation_px=region.dilation_px,
-            shift_px=prior.step.warp.shift_px,
+            shift_px=prior.step.warp.centre_shift_px(frame.size_hw),
             raw_coverage=region.raw_coverage,
             ego_model=change.step.model,
             timings=clock.timings,

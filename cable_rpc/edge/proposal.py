@@ -46,7 +46,8 @@ class RoiProposal:
     dilation_px: float = 0.0
     """b_k, full-frame pixels; 0 before the first mask."""
     shift_px: float = 0.0
-    """Horizontal shift of the prior, full-frame pixels, positive to the right; 0 before the first mask."""
+    """Horizontal shift of the prior at the frame's centre, full-frame pixels, positive to the right; 0 before the
+    first mask."""
     raw_coverage: float = 1.0
     """Share of the frame in Rraw_k, before the corridor; 1 where no mask has come yet."""
     ego_model: str = ""

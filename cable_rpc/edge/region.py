@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from cable_rpc.edge.actor_warp import warp_actors
@@ -72,6 +74,24 @@ def with_moving_actors(standing: BoolMask, prior: Prior, config: RoiConfig) -> B
         return standing
     along = moved_mask(prior.support, EgoStep(ViewWarp(warp.far)), config)
     return standing | along
+
+
+def vanished_pieces(before: Sequence[BoolMask], now: BoolMask) -> BoolMask:
+    """Connected pieces of earlier masks, moved to the newest mask's frame, that nothing of that mask touches.
+
+    A piece that is touched is an actor still seen, and its old place is none of the prior's business.
+
+    Args:
+        before: bool [rows, columns] each.
+        now: bool [rows, columns].
+    """
+    together = np.logical_or.reduce(before)
+    _, labels = cv2.connectedComponents((together | now).view(np.uint8), connectivity=8)
+    seen = np.zeros(labels.max() + 1, np.bool_)
+    seen[labels[now]] = True
+    seen[0] = True
+    vanished: BoolMask = ~seen[labels]
+    return vanished
 
 
 def region_blocks(cells: BoolMask, scale: int, size_hw: tuple[int, int], block_size: int) -> RoiMask:

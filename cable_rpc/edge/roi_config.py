@@ -66,6 +66,8 @@ class RoiConfig:
     keep_unseen: bool = True
     """An answer says nothing of what lay outside the region that was sent: a newer prior that was not known when
     that region was chosen stays there. In lock-step there is no such prior."""
+    linger_answers: int = 8
+    """A piece of the mask that the cloud no longer sees stays in the prior for so many answers: detections flicker."""
     # Dilation
     dilation_base_px: float = 8.0
     """b_0."""
@@ -198,6 +200,7 @@ PAPER = RoiConfig(
     upright_actors=False,
     moving_actors=False,
     keep_unseen=False,
+    linger_answers=0,
     residual_noise_factor=0.0,
     residual_opening=False,
     min_residual_area_px=0,

@@ -14,7 +14,7 @@ from cable_rpc.edge.ego_motion import EgoStep
 from cable_rpc.edge.keyframe_policy import KeyframeScheduler, KeyframeSignals, NewAnswer
 from cable_rpc.edge.proposal import RoiProposal
 from cable_rpc.edge.refresh import mask_iou, revealed_share
-from cable_rpc.edge.region import Prior, Region, RegionPredictor, moved_mask, region_blocks
+from cable_rpc.edge.region import Prior, Region, RegionPredictor, moved_mask, region_blocks, vanished_pieces
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.edge.stage_clock import StageClock
 from cable_rpc.edge.view_change import ViewChange, ViewChangeEstimator
@@ -93,6 +93,7 @@ class RoiTracker:
         self._last_time_ns = 0
         self._last_region: Region | None = None
         self._prior: Prior | None = None
+        self._recent_masks: list[BoolMask] = []
         self._answer: NewAnswer | None = None
         self._prior_iou: float | None = None
         self._history: OrderedDict[int, ProposedFrame] = OrderedDict()
@@ -138,7 +139,7 @@ class RoiTracker:
             prior_index=prior.index,
             staleness=prior.staleness,
             dilation_px=region.dilation_px,
-            shift_px=prior.step.warp.shift_px,
+            shift_px=prior.step.warp.centre_shift_px(frame.size_hw),
             raw_coverage=region.raw_coverage,
             steps=region.steps,
         )
@@ -175,7 +176,9 @@ class RoiTracker:
         scale = self.config.analysis_scale
         cells = mask.copy() if scale == 1 else RoiMask.from_pixels(mask, scale).blocks
         self._judge(proposed, cells, confidence)
-        cells = self._with_unseen(index, proposed, cells)
+        since_prior = self._step_from_prior_to(index)
+        cells = self._with_unseen(proposed, cells, since_prior)
+        recent = [moved_mask(mask, since_prior, self.config) for mask in self._recent_masks]
         for older in [known for known in self._history if known <= index]:
             del self._history[older]
         step = EgoStep()
@@ -184,6 +187,9 @@ class RoiTracker:
         support = cells
         if uncertainty is not None and self.config.dilation_uncertainty_px > 0:
             support = grow_uncertain(cells, uncertainty, scale, self.config.dilation_uncertainty_px)
+        if recent:
+            support = support | vanished_pieces(recent, cells)
+        self._recent_masks = [cells, *recent][: self.config.linger_answers]
         self._prior = Prior(index, cells, support, step, len(self._history))
         self._heard_time_ns = self._last_time_ns
 
@@ -193,18 +199,23 @@ class RoiTracker:
         if proposed is not None:
             self._scheduler.sent(proposed.keyframe, byte_count, proposed.time_ns)
 
-    def _with_unseen(self, index: int, proposed: ProposedFrame, cells: BoolMask) -> BoolMask:
+    def _step_from_prior_to(self, index: int) -> EgoStep:
+        """The way from the present prior's frame to a later one that is still remembered."""
+        step = EgoStep()
+        if self._prior is not None:
+            for following, one in self._history.items():
+                if self._prior.index < following <= index:
+                    step = step.then(one.step)
+        return step
+
+    def _with_unseen(self, proposed: ProposedFrame, cells: BoolMask, since_prior: EgoStep) -> BoolMask:
         """A frame's mask, joined outside its region by a prior that is newer than the one it was sent with."""
         prior = self._prior
         if not self.config.keep_unseen or prior is None or proposed.keyframe or proposed.region is None:
             return cells
         if proposed.prior_index is not None and proposed.prior_index >= prior.index:
             return cells
-        step = EgoStep()
-        for following, one in self._history.items():
-            if prior.index < following <= index:
-                step = step.then(one.step)
-        known = moved_mask(prior.mask, step, self.config)
+        known = moved_mask(prior.mask, since_prior, self.config)
         return cells | (known & ~unpacked(proposed.region, cells.shape))
 
     def _judge(self, proposed: ProposedFrame, cells: BoolMask, confidence: float) -> None:

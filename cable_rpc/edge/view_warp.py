@@ -67,6 +67,18 @@ class ViewWarp:
         """Entry [0, 2] of ``ground``: the shift to the right, in pixels, of a pure translation."""
         return float(self.ground[0, 2])
 
+    def centre_shift_px(self, size_hw: tuple[int, int]) -> float:
+        """How far the point at a picture's centre moves to the right, in pixels; NaN where it leaves the camera's view.
+
+        Args:
+            size_hw: (height, width) of the picture.
+        """
+        centre = np.array([(size_hw[1] - 1) / 2, (size_hw[0] - 1) / 2, 1.0])
+        homography = self.far if self.far is not None and centre[1] < (self.horizon_row or 0) else self.ground
+        with np.errstate(all="ignore"):
+            x, _, depth = homography @ centre
+            return float(x / depth - centre[0]) if depth > 0 else math.nan
+
     @property
     def is_identity(self) -> bool:
         """Whether nothing moves."""

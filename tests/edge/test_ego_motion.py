@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -306,3 +308,11 @@ def check_bounded(warp, seed):
 def test_overflowing_steps_compose():
     step = EgoStep(ViewWarp(translation(1.7e308))).then(EgoStep(ViewWarp(translation(1.7e308))))
     assert not warp_mask(np.ones((4, 4), np.bool_), step.warp).any()
+
+
+def test_a_turn_shifts_the_centre_by_the_focal_length_times_its_tangent():
+    camera = CameraIntrinsics(800.0, 800.0, 479.5, 269.5)
+    warp = ViewWarp(rotation_homography(camera, 0.0, math.radians(2.0)))
+    assert warp.centre_shift_px((540, 960)) == pytest.approx(800 * math.tan(math.radians(2.0)))
+    assert ViewWarp().centre_shift_px((540, 960)) == 0
+    assert math.isnan(ViewWarp(rotation_homography(camera, 0.0, math.pi)).centre_shift_px((540, 960)))

@@ -303,3 +303,28 @@ def test_late_answers_do_not_undo_a_keyframe(delay):
     # Seen to be lost, found by a keyframe, known: two rounds of the delay, and it stays known.
     assert not any(missed[20 + 2 * delay + 1 :])
     assert keyframes <= delay + 1 + 2
+
+
+def test_an_actor_whom_the_cloud_misses_for_a_while_stays_inside():
+    steady, flickering = box(100, 40, 40, 60), box(110, 300, 20, 30)
+    tracker = RoiTracker()
+    for k in range(40):
+        proposal = tracker.propose(frame(k))
+        sent = proposal.roi.pixels()
+        missed_for = k - 10
+        if 0 < missed_for <= ROBUST.linger_answers and not proposal.keyframe:
+            assert (sent & flickering).sum() == flickering.sum(), k
+        if missed_for > ROBUST.linger_answers + 1 and not proposal.keyframe:
+            assert not (sent & flickering).any(), k
+        tracker.update(k, (steady | flickering if k < 10 else steady) & sent)
+
+
+def test_a_seen_actor_leaves_no_trail():
+    tracker = RoiTracker(RoiConfig(corridor=False))
+    for k in range(12):
+        actor = box(100, 20 + 10 * k, 40, 60)
+        proposal = tracker.propose(frame(k))
+        tracker.update(k, actor)
+    # Frame 11 has the mask of frame 10, which began at column 120; the ones before it overlap one another.
+    assert not proposal.keyframe
+    assert not proposal.roi.pixels()[:, :110].any()
