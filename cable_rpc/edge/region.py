@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -76,18 +75,19 @@ def with_moving_actors(standing: BoolMask, prior: Prior, config: RoiConfig) -> B
     return standing | along
 
 
-def vanished_pieces(before: Sequence[BoolMask], now: BoolMask) -> BoolMask:
-    """Connected pieces of earlier masks, moved to the newest mask's frame, that nothing of that mask touches.
+def vanished_pieces(before: BoolMask, now: BoolMask) -> BoolMask:
+    """Connected pieces of an earlier mask, moved to the newest mask's frame, that nothing of that mask touches.
 
     A piece that is touched is an actor still seen, and its old place is none of the prior's business.
 
     Args:
-        before: bool [rows, columns] each.
+        before: bool [rows, columns].
         now: bool [rows, columns].
     """
-    together = np.logical_or.reduce(before)
-    _, labels = cv2.connectedComponents((together | now).view(np.uint8), connectivity=8)
-    seen = np.zeros(labels.max() + 1, np.bool_)
+    count, labels = cv2.connectedComponentsWithAlgorithm(
+        (before | now).view(np.uint8), 8, cv2.CV_32S, cv2.CCL_SPAGHETTI
+    )
+    seen = np.zeros(count, np.bool_)
     seen[labels[now]] = True
     seen[0] = True
     vanished: BoolMask = ~seen[labels]

@@ -93,7 +93,7 @@ class RoiTracker:
         self._last_time_ns = 0
         self._last_region: Region | None = None
         self._prior: Prior | None = None
-        self._recent_masks: list[BoolMask] = []
+        self._missed: list[tuple[BoolMask, int]] = []
         self._answer: NewAnswer | None = None
         self._prior_iou: float | None = None
         self._history: OrderedDict[int, ProposedFrame] = OrderedDict()
@@ -177,8 +177,9 @@ class RoiTracker:
         cells = mask.copy() if scale == 1 else RoiMask.from_pixels(mask, scale).blocks
         self._judge(proposed, cells, confidence)
         since_prior = self._step_from_prior_to(index)
-        cells = self._with_unseen(proposed, cells, since_prior)
-        recent = [moved_mask(mask, since_prior, self.config) for mask in self._recent_masks]
+        before = self._prior_at(proposed, cells.shape, since_prior)
+        cells = self._with_unseen(proposed, cells, before)
+        self._missed = self._still_missed(cells, before, since_prior)
         for older in [known for known in self._history if known <= index]:
             del self._history[older]
         step = EgoStep()
@@ -187,9 +188,8 @@ class RoiTracker:
         support = cells
         if uncertainty is not None and self.config.dilation_uncertainty_px > 0:
             support = grow_uncertain(cells, uncertainty, scale, self.config.dilation_uncertainty_px)
-        if recent:
-            support = support | vanished_pieces(recent, cells)
-        self._recent_masks = [cells, *recent][: self.config.linger_answers]
+        if self._missed:
+            support = np.logical_or.reduce([support, *(mask for mask, _ in self._missed)])
         self._prior = Prior(index, cells, support, step, len(self._history))
         self._heard_time_ns = self._last_time_ns
 
@@ -208,15 +208,33 @@ class RoiTracker:
                     step = step.then(one.step)
         return step
 
-    def _with_unseen(self, proposed: ProposedFrame, cells: BoolMask, since_prior: EgoStep) -> BoolMask:
+    def _prior_at(self, proposed: ProposedFrame, shape: tuple[int, ...], since_prior: EgoStep) -> BoolMask | None:
+        """The present prior's mask, seen from an answered frame."""
+        if self._prior is None:
+            return None
+        if proposed.prior is not None and proposed.prior_index == self._prior.index:
+            return unpacked(proposed.prior, shape)
+        return moved_mask(self._prior.mask, since_prior, self.config)
+
+    def _still_missed(
+        self, cells: BoolMask, before: BoolMask | None, since_prior: EgoStep
+    ) -> list[tuple[BoolMask, int]]:
+        """Pieces of earlier masks that the cloud has not seen again, with the answers for which they stay."""
+        if before is None or self.config.linger_answers == 0:
+            return []
+        missed = [(moved_mask(mask, since_prior, self.config), left - 1) for mask, left in self._missed if left > 1]
+        missed.append((before, self.config.linger_answers))
+        gone = [(vanished_pieces(mask, cells), left) for mask, left in missed]
+        return [(mask, left) for mask, left in gone if mask.any()]
+
+    def _with_unseen(self, proposed: ProposedFrame, cells: BoolMask, before: BoolMask | None) -> BoolMask:
         """A frame's mask, joined outside its region by a prior that is newer than the one it was sent with."""
         prior = self._prior
         if not self.config.keep_unseen or prior is None or proposed.keyframe or proposed.region is None:
             return cells
         if proposed.prior_index is not None and proposed.prior_index >= prior.index:
             return cells
-        known = moved_mask(prior.mask, since_prior, self.config)
-        return cells | (known & ~unpacked(proposed.region, cells.shape))
+        return cells if before is None else cells | (before & ~unpacked(proposed.region, cells.shape))
 
     def _judge(self, proposed: ProposedFrame, cells: BoolMask, confidence: float) -> None:
         if proposed.prior is not None:
