@@ -11,6 +11,7 @@ import typer
 from cable_codecs import CodecError
 
 import cable_rpc
+from cable_rpc.cli.codec_study import codec_study
 from cable_rpc.cli.demo import demo
 from cable_rpc.cli.inspect import inspect
 from cable_rpc.cli.serve import serve
@@ -29,6 +30,7 @@ app.command()(serve)
 app.command()(stream)
 app.command()(demo)
 app.command()(inspect)
+app.command()(codec_study)
 
 
 def _version(wanted: bool) -> None:

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from cable_rpc.cli.progress import RunProgress
-from cable_rpc.cli.roi_options import roi_config
+from cable_rpc.cli.roi_options import region_treatment, roi_config
 from cable_rpc.data.source import FrameSource, open_source
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.strategies import STRATEGIES
@@ -35,9 +35,25 @@ def stream(
         ),
     ],
     target: Annotated[str, typer.Option(help="HOST:PORT of the server.", metavar="HOST:PORT")] = "127.0.0.1:50051",
-    codec: Annotated[str, typer.Option(help="h264 | jpeg | webp.")] = "h264",
+    codec: Annotated[str, typer.Option(help=" | ".join(CODECS_BY_NAME) + "; `doctor` says which run here.")] = "h264",
     quality: Annotated[
-        int | None, typer.Option(help="JPEG/WebP quality 1..100 (75), H.264 CRF 0..51 (28; lower is better).")
+        int | None,
+        typer.Option(help="JPEG/WebP quality 1..100 (75), video CRF (H.264: 0..51, 28; lower is better)."),
+    ] = None,
+    bitrate: Annotated[
+        float | None, typer.Option(help="Constant rate in kbit/s instead of constant quality.", min=1)
+    ] = None,
+    encoder: Annotated[
+        str | None, typer.Option(help="Video encoder by FFmpeg's name, or auto-hardware; falls back to software aloud.")
+    ] = None,
+    preset: Annotated[str | None, typer.Option(help="The encoder's effort in its own words, e.g. superfast.")] = None,
+    treatment: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Change how regions are treated before coding, e.g. fill=grey, grid=16, hold_frames=5, crop=box, "
+            "scale=0.5, compose=true, or fill=keep with quantiser_offset=0.4 (soft); may be repeated.",
+            metavar="KEY=VALUE",
+        ),
     ] = None,
     strategy: Annotated[
         str,
@@ -99,7 +115,7 @@ def stream(
     if pace not in {"lockstep", "realtime"}:
         raise ConfigurationError(f"--pace is '{pace}'; use lockstep or realtime")
     if codec not in CODECS_BY_NAME:
-        raise ConfigurationError(f"--codec is '{codec}'; use h264, jpeg or webp")
+        raise ConfigurationError(f"--codec is '{codec}'; use one of {', '.join(CODECS_BY_NAME)}")
     frame_size = parse_size(size)
     opened = open_source(
         source,
@@ -115,6 +131,10 @@ def stream(
         out=out,
         codec=codec,
         quality=quality,
+        bitrate_kbps=bitrate,
+        encoder=encoder,
+        preset=preset,
+        treatment=region_treatment(codec, treatment or ()),
         strategy=strategy,
         roi=roi_config(mode, roi or (), keyframes),
         realtime=pace == "realtime",

@@ -17,7 +17,7 @@ from typing import Any
 from google.rpc import code_pb2, status_pb2
 
 from cable_rpc.cloud.perception import Perception, PerceptionModels
-from cable_rpc.cloud.stream_decoder import STILL_CODECS, DecodedFrame, FrameRejection, StreamDecoder
+from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
 from cable_rpc.errors import CableError, ProtocolError
 from cable_rpc.wire.convert import (
     PROTOCOL_REVISION,
@@ -277,7 +277,7 @@ class PerceptionSession:
 
     def _request_keyframe(self) -> None:
         decoder = self._decoder
-        if decoder is None or self._codec in STILL_CODECS or self._keyframe_requested:
+        if decoder is None or self._keyframe_requested:
             return
         if decoder.needs_keyframe:
             self._keyframe_requested = True

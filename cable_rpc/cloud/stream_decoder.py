@@ -1,18 +1,20 @@
-"""From a VideoFrame message to the picture that the models see: checks, decoding, re-masking. Runs off the loop."""
+"""From a VideoFrame message to the picture that the models see: checks, decoding, treatment undone. Off the loop."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
 
-from cable_codecs import CodecError, CodecParameters, Decoder, create_decoder, fill_blocks
+from cable_codecs import STILL_CODECS, CodecError, CodecParameters, RegionTreatment, TreatedDecoder
 
 from cable_rpc.errors import FrameError, ProtocolError
 from cable_rpc.types import BoolMask, Image, RoiMask
 from cable_rpc.wire.convert import codec_name, region_from_message
+from cable_rpc.wire.treatment import treatment_from_message
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
-STILL_CODECS = frozenset({pb.CODEC_JPEG, pb.CODEC_WEBP})
+NOTHING_BUT_BLACK = RegionTreatment(grid=1)
+"""What a client does that says nothing of its treatment."""
 
 
 class FrameRejection(FrameError):
@@ -25,7 +27,7 @@ class FrameRejection(FrameError):
 
 @dataclass(frozen=True, slots=True)
 class DecodedFrame:
-    """A decoded picture, blank outside its region."""
+    """A decoded picture, outside its region as the treatment has it: blank, composed or kept."""
 
     image: Image
     """uint8 [H, W, 3] BGR."""
@@ -50,10 +52,11 @@ class StreamDecoder:
                 f"this server accepts {max_pixels}; stream at a lower resolution"
             )
         self._height, self._width = config.height, config.width
-        self._is_video = config.codec not in STILL_CODECS
+        self._is_video = name not in STILL_CODECS
+        treatment = treatment_from_message(config.treatment) if config.HasField("treatment") else NOTHING_BUT_BLACK
         parameters = CodecParameters(name, config.width, config.height, config.frame_rate or 10.0)
         try:
-            self._decoder: Decoder = create_decoder(parameters)
+            self._decoder = TreatedDecoder(parameters, treatment)
         except CodecError as error:
             raise ProtocolError(str(error)) from error
         self._in_use = threading.Lock()
@@ -70,7 +73,7 @@ class StreamDecoder:
         self._lost = True
 
     def decode(self, frame: pb.VideoFrame) -> DecodedFrame:
-        """Decodes one frame and blanks everything outside its region.
+        """Decodes one frame and undoes its treatment.
 
         Raises:
             FrameRejection: with the reason that the client is told.
@@ -79,7 +82,12 @@ class StreamDecoder:
         self._check_reference(frame)
         try:
             with self._in_use:
-                image = self._decoder.decode(frame.data)
+                restored = self._decoder.decode(
+                    frame.data,
+                    None if region is None else region.blocks,
+                    1 if region is None else region.block_size,
+                    stamp=frame.sequence,
+                )
         except CodecError as error:
             self.mark_lost()
             raise FrameRejection(
@@ -87,9 +95,7 @@ class StreamDecoder:
             ) from error
         self._lost = False
         self.last_good_sequence = frame.sequence
-        if region is None:
-            return DecodedFrame(image, None)
-        return DecodedFrame(fill_blocks(image, region.blocks, region.block_size, "zero"), region.pixels())
+        return DecodedFrame(restored.image, restored.roi)
 
     def close(self) -> None:
         """Frees the codec, after a decode that is still running in another thread."""

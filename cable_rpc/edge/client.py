@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import grpc
+from cable_codecs import STILL_CODECS, RegionTreatment
 
 import cable_rpc
 from cable_rpc.errors import ProtocolError, RemoteError
@@ -23,6 +24,7 @@ from cable_rpc.wire.convert import (
     intrinsics_to_message,
     status_code_name,
 )
+from cable_rpc.wire.treatment import treatment_to_message
 from cable_rpc.wire.v1 import perception_pb2 as pb
 from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
@@ -45,9 +47,12 @@ class SessionRequest:
     prompt: str = ""
     min_score: float = 0.0
     intrinsics: CameraIntrinsics | None = None
+    treatment: RegionTreatment | None = None
+    """What the server must undo; None: what measured best for the codec, as `FrameEncoder` takes it."""
 
     def to_hello(self) -> pb.Hello:
         """The opening message."""
+        treatment = self.treatment or RegionTreatment.default_for(stateless=self.codec in STILL_CODECS)
         return pb.Hello(
             protocol_revision=PROTOCOL_REVISION,
             client_id=self.client_id,
@@ -58,6 +63,7 @@ class SessionRequest:
                 height=self.height,
                 frame_rate=self.frame_rate,
                 quality=self.quality,
+                treatment=treatment_to_message(treatment),
             ),
             task_config=pb.TaskConfig(prompt=self.prompt, min_score=self.min_score),
             intrinsics=intrinsics_to_message(self.intrinsics) if self.intrinsics else None,

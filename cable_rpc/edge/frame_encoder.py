@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
-from cable_codecs import CodecParameters, EncodedFrame, create_encoder, fill_blocks
+from cable_codecs import (
+    JPEG_CURVE,
+    STILL_CODECS,
+    WEBP_CURVE,
+    CodecParameters,
+    EncodedFrame,
+    RegionTreatment,
+    StillRateController,
+    StillRateStatus,
+    TreatedEncoder,
+    TreatedPacket,
+)
 
 from cable_rpc.edge.capture import CapturedFrame
 from cable_rpc.edge.proposal import RoiProposal
 from cable_rpc.edge.strategy import RoiStrategy
-from cable_rpc.types import Image
+from cable_rpc.types import RoiMask
 from cable_rpc.wire.convert import ego_to_message, region_to_message
 from cable_rpc.wire.v1 import perception_pb2 as pb
-
-STILL_CODECS = frozenset({"jpeg", "webp"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +34,8 @@ class PreparedFrame:
     proposal: RoiProposal
     encoded: EncodedFrame
     message: pb.VideoFrame
+    sent_region: RoiMask
+    """What was sent: the proposal's region as treated, or the whole frame."""
     roi_ns: int
     fill_ns: int
 
@@ -41,17 +51,42 @@ class PreparedFrame:
 
 
 class FrameEncoder:
-    """One stream's region strategy, fill buffer and encoder. Not thread-safe; one worker calls it."""
+    """One stream's region strategy, treatment, encoder and rate control. Not thread-safe; one worker calls it.
 
-    def __init__(self, strategy: RoiStrategy, parameters: CodecParameters) -> None:
+    Args:
+        strategy: chooses the region.
+        parameters: of the codec; with ``bitrate_kbps`` image codecs are kept at that rate by their quality.
+        treatment: what becomes of regions; None takes what measured best for the codec.
+
+    Raises:
+        CodecError: the codec can't be opened, or can't carry pictures treated so.
+    """
+
+    def __init__(
+        self, strategy: RoiStrategy, parameters: CodecParameters, treatment: RegionTreatment | None = None
+    ) -> None:
         self.strategy = strategy
-        self._encoder = create_encoder(parameters)
         self._is_still = parameters.name in STILL_CODECS
-        self._canvas: Image = np.empty((parameters.height, parameters.width, 3), np.uint8)
+        self.treatment = RegionTreatment.default_for(stateless=self._is_still) if treatment is None else treatment
+        self._rate: StillRateController | None = None
+        if self._is_still and parameters.bitrate_kbps is not None:
+            self._rate = StillRateController(
+                parameters.bitrate_kbps,
+                parameters.frame_rate,
+                frame_pixels=parameters.width * parameters.height,
+                curve=WEBP_CURVE if parameters.name == "webp" else JPEG_CURVE,
+            )
+            parameters = replace(parameters, bitrate_kbps=None)
+        self._encoder = TreatedEncoder(parameters, self.treatment)
         self._last_index: int | None = None
 
+    @property
+    def rate_status(self) -> StillRateStatus | None:
+        """How the rate of an image codec is kept; None without a target."""
+        return None if self._rate is None else self._rate.status
+
     def prepare(self, captured: CapturedFrame, *, force_keyframe: bool) -> PreparedFrame:
-        """Chooses the region, blanks the rest, encodes.
+        """Chooses the region, treats it, encodes.
 
         Args:
             captured: the frame.
@@ -63,17 +98,34 @@ class FrameEncoder:
         frame = captured.frame
         started_ns = time.monotonic_ns()
         proposal = self.strategy.propose(frame)
-        proposed_ns = time.monotonic_ns()
+        roi_ns = time.monotonic_ns() - started_ns
         region = proposal.roi
         whole = proposal.keyframe or bool(region.blocks.all())
-        image = (
-            frame.image
-            if whole
-            else fill_blocks(frame.image, region.blocks, region.block_size, "zero", out=self._canvas)
+        if self._rate is not None:
+            pixels = round(region.coverage * region.height * region.width)
+            self._encoder.set_quality(self._rate.quality_for(pixels, whole=whole))
+        packet = self._encoder.encode(
+            frame.image, None if whole else region.blocks, region.block_size, keyframe=force_keyframe
         )
-        filled_ns = time.monotonic_ns()
-        roi = None if whole else region.pixels()
-        encoded = self._encoder.encode(image, roi, keyframe=force_keyframe)
+        if self._rate is not None:
+            self._rate.coded(len(packet.encoded.data))
+        message = self._message(captured, proposal, packet, roi_ns)
+        if packet.blocks is None:
+            sent = RoiMask.full(*frame.size_hw, region.block_size)
+        else:
+            sent = RoiMask(packet.blocks, packet.block_size, *frame.size_hw)
+            message.region.CopyFrom(region_to_message(sent))
+        self._last_index = frame.index
+        return PreparedFrame(captured, proposal, packet.encoded, message, sent, roi_ns, packet.treat_ns)
+
+    def close(self) -> None:
+        """Frees the codec."""
+        self._encoder.close()
+
+    def _message(
+        self, captured: CapturedFrame, proposal: RoiProposal, packet: TreatedPacket, roi_ns: int
+    ) -> pb.VideoFrame:
+        frame, encoded = captured.frame, packet.encoded
         message = pb.VideoFrame(
             sequence=frame.index,
             capture_time_ns=captured.available_time_ns,
@@ -82,22 +134,15 @@ class FrameEncoder:
             whole_frame=proposal.keyframe,
             timing=pb.EdgeTiming(
                 capture_ns=captured.capture_ns,
-                roi_ns=proposed_ns - started_ns,
-                fill_ns=filled_ns - proposed_ns,
+                roi_ns=roi_ns,
+                fill_ns=packet.treat_ns,
                 encode_ns=encoded.duration_ns,
             ),
         )
-        if not whole:
-            message.region.CopyFrom(region_to_message(proposal.roi))
         if proposal.prior_index is not None:
             message.prior_sequence = proposal.prior_index
         if frame.ego is not None:
             message.ego_motion.CopyFrom(ego_to_message(frame.ego))
         if not (self._is_still or encoded.keyframe) and self._last_index is not None:
             message.reference_sequence = self._last_index
-        self._last_index = frame.index
-        return PreparedFrame(captured, proposal, encoded, message, proposed_ns - started_ns, filled_ns - proposed_ns)
-
-    def close(self) -> None:
-        """Frees the codec."""
-        self._encoder.close()
+        return message

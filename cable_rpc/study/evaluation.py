@@ -9,15 +9,7 @@ from typing import IO, Any
 
 import cv2
 import numpy as np
-from cable_codecs import (
-    CodecError,
-    CodecParameters,
-    Decoder,
-    create_decoder,
-    decode_mask,
-    fill_background,
-    roi_psnr,
-)
+from cable_codecs import CodecError, CodecParameters, RegionTreatment, TreatedDecoder, decode_mask, roi_psnr
 
 from cable_rpc.edge.streamer import StreamedFrame
 from cable_rpc.study.annotate import AnnotatedVideoWriter, annotate, status_line
@@ -92,7 +84,7 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
         keyframe=proposal.keyframe,
         keyframe_reason=proposal.keyframe_reason or "",
         idr=prepared.encoded.keyframe,
-        coverage=proposal.roi.coverage,
+        coverage=prepared.sent_region.coverage,
         roi_coverage=proposal.coverage if proposal.prior_index is not None else None,
         staleness_frames=proposal.staleness,
         bitstream_bytes=len(prepared.encoded.data),
@@ -117,17 +109,23 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
         mask_coverage=float(segmentation.mask.mean()) if segmentation else None,
         mask_confidence=segmentation.confidence if segmentation else None,
     )
-    return FrameEvidence(record, proposal.roi, answer.detections, answer.mask_data)
+    return FrameEvidence(record, prepared.sent_region, answer.detections, answer.mask_data)
 
 
 class RunEvaluator:
     """Judges a run's frames in order; writes the annotated video and a few stills as it goes."""
 
     def __init__(
-        self, parameters: CodecParameters, fps: float, out: Path, spool: UplinkSpool, frame_count: int
+        self,
+        parameters: CodecParameters,
+        treatment: RegionTreatment,
+        fps: float,
+        out: Path,
+        spool: UplinkSpool,
+        frame_count: int,
     ) -> None:
         self._spool = spool
-        self._decoder: Decoder = create_decoder(parameters)
+        self._decoder = TreatedDecoder(parameters, treatment)
         self._video = AnnotatedVideoWriter(out / VIDEO_FILE, fps)
         self._stills = out / STILLS_FOLDER
         self._still_positions = {round((i + 0.5) * frame_count / STILL_COUNT) for i in range(STILL_COUNT)}
@@ -150,7 +148,7 @@ class RunEvaluator:
         """
         frame = whole.prepared.captured.frame
         roi = evidence.roi.pixels()
-        received = self._received(roi)
+        received = self._received(evidence)
         quality = _truth_quality(frame, roi, evidence.detections)
         retention = retained(whole.answer.detections, evidence.detections)
         psnr = roi_psnr(frame.image, received, roi) if received is not None and roi.any() else None
@@ -169,14 +167,17 @@ class RunEvaluator:
         self._position += 1
         return judged
 
-    def _received(self, roi: BoolMask) -> Image | None:
-        """What the cloud decoded of the next frame; None where it could not."""
-        data = self._spool.read_next()
+    def _received(self, evidence: FrameEvidence) -> Image | None:
+        """What the cloud's models saw of the next frame; None where it could not be decoded."""
+        data, region = self._spool.read_next(), evidence.roi
+        whole = evidence.record.roi_bytes == 0
         try:
-            image = self._decoder.decode(data)
+            restored = self._decoder.decode(
+                data, None if whole else region.blocks, region.block_size, stamp=evidence.record.index
+            )
         except CodecError:
             return None
-        return fill_background(image, roi, "zero")
+        return restored.image
 
     def _draw(self, frame: Frame, evidence: FrameEvidence, received: Image | None) -> None:
         record = evidence.record

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from cable_codecs import DEFAULT_CRF, DEFAULT_QUALITY, CodecParameters
+from cable_codecs import STILL_CODECS, CodecParameters, RegionTreatment, default_quality
 
 import cable_rpc
 from cable_rpc.data.source import FrameSource
@@ -33,6 +33,8 @@ from cable_rpc.study.run_record import (
 )
 from cable_rpc.study.strategies import open_strategy
 from cable_rpc.study.summary import RunSummary, summarise, write_summary
+from cable_rpc.study.transport_counters import measure_link
+from cable_rpc.study.transport_estimate import TransportBytes, estimate_exchanges
 from cable_rpc.types import CameraIntrinsics, Frame
 
 RecordListener = Callable[[str, FrameRecord], None]
@@ -49,7 +51,14 @@ class StreamRunConfig:
     out: Path
     codec: str = "h264"
     quality: int | None = None
-    """JPEG/WebP 1..100, H.264 CRF; None = the codec's default."""
+    """JPEG/WebP 1..100, video codecs CRF; None = the codec's default."""
+    bitrate_kbps: float | None = None
+    """Constant rate instead of constant quality."""
+    preset: str | None = None
+    encoder: str | None = None
+    """FFmpeg's name of the encoder, or ``auto-hardware``; None = software."""
+    treatment: RegionTreatment | None = None
+    """What becomes of regions before coding; None = what measured best for the codec."""
     strategy: str = "cable"
     """A name of `cable_rpc.study.strategies.STRATEGIES`."""
     realtime: bool = False
@@ -74,9 +83,20 @@ class StreamRun:
         self._config = config
         self._listener = listener
         width, height = source.size_wh
-        self._parameters = CodecParameters(config.codec, width, height, source.fps, config.quality)
+        self._parameters = CodecParameters(
+            config.codec,
+            width,
+            height,
+            source.fps,
+            config.quality,
+            preset=config.preset,
+            encoder=config.encoder,
+            bitrate_kbps=config.bitrate_kbps,
+        )
+        self._treatment = config.treatment or RegionTreatment.default_for(stateless=config.codec in STILL_CODECS)
         self._evidence: list[FrameEvidence] = []
         self._unsent: list[FrameRecord] = []
+        self._measured_link: TransportBytes | None = None
         self._info = RunInfo(
             source=source.name,
             width=width,
@@ -123,7 +143,7 @@ class StreamRun:
         with FrameCsvWriter(config.out / FRAMES_FILE) as csv:
             async with self._session(realtime=config.realtime) as client:
                 self._describe(client)
-                streamer = EdgeStreamer(capture, FrameEncoder(strategy, self._parameters), client)
+                streamer = EdgeStreamer(capture, FrameEncoder(strategy, self._parameters, self._treatment), client)
                 try:
                     async with aclosing(streamer.run()) as streamed_frames:
                         async for streamed in streamed_frames:
@@ -134,13 +154,16 @@ class StreamRun:
                             self._listener("stream", evidence.record)
                 finally:
                     self._describe(client)
+                    self._measured_link = measure_link(config.target)
                     self._unsent = [
                         *(FrameRecord(index, 0, "dropped") for index in capture.dropped),
                         *(FrameRecord(index, 0, "lost") for index in streamer.unanswered),
                     ]
 
     async def _evaluate(self, spool: UplinkSpool) -> None:
-        evaluator = RunEvaluator(self._parameters, self._source.fps, self._config.out, spool, len(self._evidence))
+        evaluator = RunEvaluator(
+            self._parameters, self._treatment, self._source.fps, self._config.out, spool, len(self._evidence)
+        )
         with evaluator:
             async with aclosing(self._whole_frames()) as whole_frames:
                 position = 0
@@ -155,7 +178,7 @@ class StreamRun:
         indices = {evidence.record.index for evidence in self._evidence}
         capture = Capture(_only(self._source, indices), realtime=False)
         async with self._session(realtime=False) as client:
-            encoder = FrameEncoder(FullFrame(self._config.block_size), self._parameters)
+            encoder = FrameEncoder(FullFrame(self._config.block_size), self._parameters, self._treatment)
             streamer = EdgeStreamer(capture, encoder, client)
             async with aclosing(streamer.run()) as streamed_frames:
                 async for streamed in streamed_frames:
@@ -173,6 +196,7 @@ class StreamRun:
             prompt=config.prompt,
             min_score=config.min_score,
             intrinsics=_intrinsics(self._source),
+            treatment=self._treatment,
         )
         window = None if realtime else 1
         return PerceptionClient(config.target, request, window=window, connect_timeout_s=config.connect_timeout_s)
@@ -193,15 +217,30 @@ class StreamRun:
         records = [evidence.record for evidence in self._evidence] + self._unsent
         records.sort(key=lambda record: record.index)
         write_frames(self._config.out / FRAMES_FILE, records)
-        summary = summarise(records, self._info)
+        summary = summarise(records, _with_transport(self._info, records, self._measured_link))
         write_summary(self._config.out, summary)
         return summary
 
     def _quality_text(self) -> str:
-        quality = self._config.quality
-        if self._config.codec == "h264":
-            return f"CRF {DEFAULT_CRF if quality is None else quality}"
-        return f"quality {DEFAULT_QUALITY if quality is None else quality}"
+        config = self._config
+        if config.bitrate_kbps is not None:
+            return f"{config.bitrate_kbps:g} kbit/s"
+        quality = default_quality(config.codec) if config.quality is None else config.quality
+        if quality is None:
+            return "lossless"
+        return f"quality {quality}" if config.codec in STILL_CODECS else f"CRF {quality}"
+
+
+def _with_transport(info: RunInfo, records: Iterable[FrameRecord], measured: TransportBytes | None) -> RunInfo:
+    carried = measured or estimate_exchanges(
+        (record.uplink_message_bytes, record.downlink_message_bytes) for record in records
+    )
+    return replace(
+        info,
+        transport_uplink_bytes=carried.uplink,
+        transport_downlink_bytes=carried.downlink,
+        transport_source="measured" if measured else "estimate",
+    )
 
 
 def _only(source: Iterable[Frame], indices: set[int]) -> Iterator[Frame]:

@@ -17,10 +17,25 @@ PROTOCOL_REVISION = 1
 
 CODECS_BY_NAME = {
     "h264": pb.CODEC_H264,
+    "hevc": pb.CODEC_H265,
+    "av1": pb.CODEC_AV1,
+    "vp9": pb.CODEC_VP9,
     "jpeg": pb.CODEC_JPEG,
+    "jpeg-ffmpeg": pb.CODEC_JPEG,
     "webp": pb.CODEC_WEBP,
+    "webp-lossless": pb.CODEC_WEBP_LOSSLESS,
 }
-CODEC_NAMES = {number: name for name, number in CODECS_BY_NAME.items()}
+"""Codec of `cable_codecs` to bitstream format; some differ in the encoder only."""
+CODEC_NAMES = {
+    pb.CODEC_H264: "h264",
+    pb.CODEC_H265: "hevc",
+    pb.CODEC_AV1: "av1",
+    pb.CODEC_VP9: "vp9",
+    pb.CODEC_JPEG: "jpeg",
+    pb.CODEC_WEBP: "webp",
+    pb.CODEC_WEBP_LOSSLESS: "webp-lossless",
+}
+"""Bitstream format to the codec that decodes it."""
 
 
 def codec_name(codec: pb.Codec) -> str:

@@ -4,7 +4,7 @@ Two YCbCr variants of ITU-R BT.601: limited range (H.264, WebP), by OpenCV both 
 JFIF demands). swscale, FFmpeg's converter, is not used: its default path loses 10 dB and is biased.
 
 A picture is a uint8 array ``[even_height * 3 / 2, even_width]`` in I420 layout: Y, then Cb, then Cr.
-Odd sizes are padded to even ones by repeating the last row or column.
+Odd sizes are padded to even ones by repeating the last row or column, and to a codec's least size likewise.
 """
 
 from __future__ import annotations
@@ -44,14 +44,15 @@ def picture_planes(picture: Plane) -> tuple[Plane, Plane, Plane]:
 class BgrToI420:
     """Converts images of one size to I420, reusing its buffers; each call overwrites the last result."""
 
-    def __init__(self, height: int, width: int, *, full_range: bool) -> None:
+    def __init__(self, height: int, width: int, *, full_range: bool, coded: tuple[int, int] | None = None) -> None:
+        """Prepare for images of one size; ``coded`` is the (height, width) of the picture, even, None for the least."""
         self.full_range = full_range
         self.height, self.width = height, width
-        self.picture = empty_picture(height, width)
+        coded = coded or (even(height), even(width))
+        self.picture = empty_picture(*coded)
         self.planes = picture_planes(self.picture)
-        odd = (height | width) & 1
-        size = (even(height), even(width), 3)
-        self.padded = np.empty(size, np.uint8) if odd else None
+        size = (*coded, 3)
+        self.padded = np.empty(size, np.uint8) if coded != (height, width) else None
         if full_range:
             self.ycrcb = np.empty(size, np.uint8)
             self.halved = np.empty((size[0] // 2, size[1] // 2, 3), np.uint8)
@@ -59,7 +60,7 @@ class BgrToI420:
     def __call__(self, image: Image) -> Plane:
         """Convert a BGR image uint8 [height, width, 3] to the I420 picture, BT.601."""
         if self.padded is not None:
-            image = pad_to_even(image, self.padded)
+            image = pad_by_repeating(image, self.padded)
         if self.full_range:
             self.convert_full_range(image)
         else:
@@ -77,8 +78,8 @@ class BgrToI420:
         cv2.extractChannel(self.halved, 1, dst=red)
 
 
-def pad_to_even(image: Image, out: Image) -> Image:
-    """Copy an image into a buffer up to one row and column larger, repeating its last row and column."""
+def pad_by_repeating(image: Image, out: Image) -> Image:
+    """Copy an image into a larger buffer, repeating its last row and column."""
     height, width = image.shape[:2]
     out[:height, :width] = image
     out[:height, width:] = image[:, width - 1 :]
@@ -89,14 +90,16 @@ def pad_to_even(image: Image, out: Image) -> Image:
 class I420ToBgr:
     """Converts I420 pictures, BT.601, of one size to images; the caller fills ``picture`` first."""
 
-    def __init__(self, height: int, width: int, *, full_range: bool) -> None:
+    def __init__(self, height: int, width: int, *, full_range: bool, coded: tuple[int, int] | None = None) -> None:
+        """Prepare for images of one size; ``coded`` is the (height, width) of the picture, even, None for the least."""
         self.full_range = full_range
         self.height, self.width = height, width
-        self.picture = empty_picture(height, width)
+        coded = coded or (even(height), even(width))
+        self.picture = empty_picture(*coded)
         self.planes = picture_planes(self.picture)
         if full_range:
-            self.chroma = np.empty((2, even(height), even(width)), np.uint8)
-            self.ycrcb = np.empty((even(height), even(width), 3), np.uint8)
+            self.chroma = np.empty((2, *coded), np.uint8)
+            self.ycrcb = np.empty((*coded, 3), np.uint8)
 
     def __call__(self) -> Image:
         """The image of the picture, a new uint8 [height, width, 3], BGR, without the padding."""

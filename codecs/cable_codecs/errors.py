@@ -10,10 +10,12 @@ class CodecError(Exception):
 
 
 class CodecUnavailableError(CodecError):
-    """The asked codec is unknown or can't be opened on this machine."""
+    """The asked codec or encoder is unknown or can't be opened on this machine."""
 
-    def __init__(self, name: str, available: Sequence[str], reason: str = "it is not a known codec") -> None:
+    def __init__(
+        self, name: str, available: Sequence[str], reason: str = "it is not a known codec", kind: str = "codec"
+    ) -> None:
         self.name = name
         self.available = tuple(available)
         listed = ", ".join(self.available) or "none"
-        super().__init__(f"codec {name!r} can't be used: {reason}; available codecs: {listed}")
+        super().__init__(f"{kind} {name!r} can't be used: {reason}; available {kind}s: {listed}")

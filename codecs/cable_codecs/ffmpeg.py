@@ -7,6 +7,7 @@ from fractions import Fraction
 from typing import Literal
 
 import av
+import cv2
 import numpy as np
 from av.codec.context import ThreadType
 from av.video.codeccontext import VideoCodecContext
@@ -33,6 +34,8 @@ def open_encoder(
     full_range: bool,
     options: Mapping[str, str],
     interval: int | None = None,
+    bit_rate: int | None = None,
+    pixel_format: str | None = None,
 ) -> VideoCodecContext:
     """Open an encoder for 4:2:0 pictures tagged BT.601.
 
@@ -43,6 +46,8 @@ def open_encoder(
         full_range: Tag as full range (JFIF) instead of limited range.
         options: Private options of the encoder.
         interval: Frames between keyframes at most, None for image codecs.
+        bit_rate: Bits per second, None for constant quality.
+        pixel_format: Of the frames; None for I420 of the range given.
 
     Raises:
         CodecError: The encoder isn't in this FFmpeg or refuses the settings.
@@ -50,7 +55,7 @@ def open_encoder(
     try:
         context = create_context(library, "w")
         context.height, context.width = size
-        context.pix_fmt = "yuvj420p" if full_range else "yuv420p"
+        context.pix_fmt = pixel_format or ("yuvj420p" if full_range else "yuv420p")
         rate = Fraction(parameters.frame_rate).limit_denominator(1001)
         context.framerate, context.time_base = rate, 1 / rate
         context.color_range = JPEG_RANGE if full_range else MPEG_RANGE
@@ -59,12 +64,15 @@ def open_encoder(
         context.thread_type = ThreadType.SLICE
         if interval is not None:
             context.gop_size, context.max_b_frames = interval, 0
+        if bit_rate is not None:
+            context.bit_rate = bit_rate
         context.options = dict(options)
         context.open()
     except (av.FFmpegError, ValueError) as error:
+        detail = error.strerror if isinstance(error, av.FFmpegError) else "this FFmpeg was built without it"
         raise CodecError(
-            f"{library} can't be opened for {parameters.width}x{parameters.height}: {error}; "
-            "check the size and the quality, or choose another codec"
+            f"{library} can't be opened for {parameters.width}x{parameters.height}: {detail}; "
+            "check the size, the quality and the preset, or choose another codec"
         ) from error
     return context
 
@@ -110,6 +118,17 @@ def frame_of_picture(picture: Plane, height: int, width: int, pixel_format: str)
     frame = VideoFrame(width, height, pixel_format)
     for plane, source in zip(frame.planes, picture_planes(picture), strict=True):
         plane_view(plane)[:] = source[: plane.height, : plane.width]
+    return frame
+
+
+def nv12_frame_of_picture(picture: Plane) -> VideoFrame:
+    """A frame with interleaved chroma, as most hardware encoders take it, from an I420 picture."""
+    luma, blue, red = picture_planes(picture)
+    height, width = luma.shape
+    frame = VideoFrame(width, height, "nv12")
+    for plane, source in zip(frame.planes, (luma, cv2.merge([blue, red]).reshape(-1, width)), strict=True):
+        rows = np.frombuffer(memoryview(plane), np.uint8)[: len(source) * plane.line_size]
+        rows.reshape(len(source), plane.line_size)[:, :width] = source
     return frame
 
 

@@ -5,7 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-CODECS = ("jpeg", "webp", "h264")
+STILLS = ("jpeg", "jpeg-ffmpeg", "webp", "webp-lossless")
+VIDEOS = ("h264", "hevc", "av1", "vp9")
+CODECS = STILLS + VIDEOS
+LOSSY = tuple(name for name in CODECS if name != "webp-lossless")
+BEST = {"jpeg": 100, "jpeg-ffmpeg": 100, "webp": 100, "webp-lossless": None, "h264": 1, "hevc": 1, "av1": 1, "vp9": 1}
+HIGH = {"jpeg": 92, "jpeg-ffmpeg": 92, "webp": 92, "webp-lossless": None, "h264": 16, "hevc": 16, "av1": 20, "vp9": 16}
 
 
 def natural_image(height: int, width: int, seed: int = 0) -> np.ndarray:

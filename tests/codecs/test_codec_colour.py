@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from cable_codecs import CodecParameters, create_decoder, create_encoder
-from codec_images import CODECS, natural_image
+from codec_images import BEST, CODECS, STILLS, natural_image
 from PIL import Image
-
-BEST = {"jpeg": 100, "webp": 100, "h264": 1}
 
 
 def blockwise_image() -> np.ndarray:
@@ -26,7 +24,7 @@ def test_colour_is_unbiased_and_faithful(name):
     parameters = CodecParameters(name, 320, 240, quality=BEST[name])
     decoded = create_decoder(parameters).decode(create_encoder(parameters).encode(image).data)
     difference = decoded.astype(np.float64) - image
-    assert 10 * np.log10(255**2 / np.mean(difference**2)) >= 45
+    assert np.mean(difference**2) <= 255**2 / 10**4.5  # 45 dB
     assert np.abs(difference.mean(axis=(0, 1))).max() < 0.5
 
 
@@ -39,11 +37,11 @@ def test_flat_colours(name, colour):
     assert np.abs(decoded.astype(int) - colour).max() <= 4
 
 
-@pytest.mark.parametrize("name", ["jpeg", "webp"])
+@pytest.mark.parametrize("name", STILLS)
 @pytest.mark.parametrize("size", [(240, 320), (119, 161)])
 def test_other_readers_see_the_same_colours(name, size):
     image = natural_image(*size)
-    parameters = CodecParameters(name, size[1], size[0], quality=90)
+    parameters = CodecParameters(name, size[1], size[0], quality=None if name == "webp-lossless" else 90)
     data = create_encoder(parameters).encode(image).data
     ours = create_decoder(parameters).decode(data).astype(np.float64)
     by_opencv = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(np.float64)

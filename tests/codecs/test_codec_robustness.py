@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from cable_codecs import CodecError, CodecParameters, create_decoder, create_encoder
-from codec_images import CODECS, luma_psnr, natural_image
+from codec_images import CODECS, STILLS, luma_psnr, natural_image
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,7 +23,7 @@ def decode_or_refuse(decoder, data):
 
 
 @pytest.mark.parametrize("name", CODECS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_flipped_and_cut_packets(name, data):
     packet = bytearray(PACKETS[name])
@@ -35,7 +35,7 @@ def test_flipped_and_cut_packets(name, data):
 
 
 @pytest.mark.parametrize("name", CODECS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(garbage=st.binary(max_size=300), head=st.integers(0, 40))
 def test_garbage(name, garbage, head):
     decoder = create_decoder(CodecParameters(name, 64, 48))
@@ -46,20 +46,20 @@ def test_garbage(name, garbage, head):
 @pytest.mark.parametrize("name", CODECS)
 @pytest.mark.parametrize("other", CODECS)
 def test_packets_of_another_codec(name, other):
-    if name == other:
+    if name.split("-ffmpeg")[0] == other.split("-ffmpeg")[0]:
         return
     with pytest.raises(CodecError):
         create_decoder(CodecParameters(name, 64, 48)).decode(PACKETS[other])
 
 
-@pytest.mark.parametrize("name", ["jpeg", "webp"])
+@pytest.mark.parametrize("name", STILLS)
 @pytest.mark.parametrize("change", [lambda b: b"", lambda b: b[:-1], lambda b: b[: len(b) // 2], lambda b: b + b])
 def test_still_images_must_be_whole(name, change):
     with pytest.raises(CodecError, match=r"cut|joined"):
         create_decoder(CodecParameters(name, 64, 48)).decode(change(PACKETS[name]))
 
 
-@pytest.mark.parametrize("name", ["jpeg", "webp"])
+@pytest.mark.parametrize("name", STILLS)
 @pytest.mark.parametrize(("width", "height"), [(66, 48), (64, 47), (16, 16), (1500, 1000)])
 def test_still_images_of_another_size(name, width, height):
     data = create_encoder(CodecParameters(name, width, height)).encode(natural_image(height, width)).data

@@ -12,7 +12,15 @@ from rich.console import Console
 
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.annotate import AnnotatedVideoWriter, annotate
-from cable_rpc.study.run_record import FrameCsvWriter, FrameRecord, RunInfo, read_frames, read_run_info, write_frames
+from cable_rpc.study.run_record import (
+    FrameCsvWriter,
+    FrameRecord,
+    RunInfo,
+    TransportSource,
+    read_frames,
+    read_run_info,
+    write_frames,
+)
 from cable_rpc.study.summary import summarise, write_summary
 from cable_rpc.study.summary_table import render_summary
 from cable_rpc.types import Detections
@@ -89,6 +97,31 @@ def test_summary_by_hand() -> None:
     assert dict(summary.quality.recognition)[0.5] == pytest.approx(0.5)
     assert summary.quality.micro is not None
     assert summary.quality.micro.recall == pytest.approx(0.5)
+
+
+def test_estimated_transport_is_set_against_the_full_frame_by_the_same_formula() -> None:
+    info = replace(INFO, transport_uplink_bytes=9_000, transport_downlink_bytes=4_000, transport_source="estimate")
+    summary = summarise(RECORDS, info)
+    transport = summary.layer("transport")
+    assert transport.uplink_bytes_per_frame == pytest.approx(9_000 / 4)
+    assert transport.downlink_bytes_per_frame == pytest.approx(4_000 / 4)
+    # 4050 B take three packets, 1100 B one; the answer's acknowledgement and window update ride along.
+    whole, region, back = 4050 + 14 + 3 * 52, 1100 + 14 + 52, 52 + 13
+    assert transport.full_frame_bytes_per_frame == pytest.approx(whole + back)
+    assert transport.byte_saving == pytest.approx(1 - (whole + 3 * region + 4 * back) / (4 * (whole + back)))
+
+
+@pytest.mark.parametrize("source", ["measured", "estimate", "not measured"])
+def test_transport_says_where_its_figure_is_from(source: TransportSource) -> None:
+    known = source != "not measured"
+    info = replace(INFO, transport_uplink_bytes=9_000 if known else None, transport_source=source)
+    summary = summarise(RECORDS, info)
+    assert (summary.layer("transport").byte_saving is None) == (source != "estimate")
+    console = Console(width=100, record=True, quiet=True)
+    console.print(render_summary(summary))
+    text = console.export_text()
+    assert f"transport ({source})" in text
+    assert ("Transport bytes" in text) == known
 
 
 def test_summary_of_nothing_and_without_baseline() -> None:

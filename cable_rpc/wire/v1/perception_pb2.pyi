@@ -14,12 +14,39 @@ class Codec(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     CODEC_H265: _ClassVar[Codec]
     CODEC_JPEG: _ClassVar[Codec]
     CODEC_WEBP: _ClassVar[Codec]
+    CODEC_AV1: _ClassVar[Codec]
+    CODEC_VP9: _ClassVar[Codec]
+    CODEC_WEBP_LOSSLESS: _ClassVar[Codec]
 
 class ResultKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     RESULT_KIND_UNSPECIFIED: _ClassVar[ResultKind]
     RESULT_KIND_DETECTION: _ClassVar[ResultKind]
     RESULT_KIND_SEGMENTATION: _ClassVar[ResultKind]
+
+class BackgroundFill(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    BACKGROUND_FILL_UNSPECIFIED: _ClassVar[BackgroundFill]
+    BACKGROUND_FILL_ZERO: _ClassVar[BackgroundFill]
+    BACKGROUND_FILL_GREY: _ClassVar[BackgroundFill]
+    BACKGROUND_FILL_MEAN: _ClassVar[BackgroundFill]
+    BACKGROUND_FILL_BLUR: _ClassVar[BackgroundFill]
+    BACKGROUND_FILL_FREEZE: _ClassVar[BackgroundFill]
+    BACKGROUND_FILL_KEEP: _ClassVar[BackgroundFill]
+
+class CropMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CROP_MODE_UNSPECIFIED: _ClassVar[CropMode]
+    CROP_MODE_ROWS: _ClassVar[CropMode]
+    CROP_MODE_BOX: _ClassVar[CropMode]
+
+class Interpolation(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    INTERPOLATION_UNSPECIFIED: _ClassVar[Interpolation]
+    INTERPOLATION_CUBIC: _ClassVar[Interpolation]
+    INTERPOLATION_LINEAR: _ClassVar[Interpolation]
+    INTERPOLATION_NEAREST: _ClassVar[Interpolation]
+    INTERPOLATION_LANCZOS: _ClassVar[Interpolation]
 
 class RejectReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -42,9 +69,27 @@ CODEC_H264: Codec
 CODEC_H265: Codec
 CODEC_JPEG: Codec
 CODEC_WEBP: Codec
+CODEC_AV1: Codec
+CODEC_VP9: Codec
+CODEC_WEBP_LOSSLESS: Codec
 RESULT_KIND_UNSPECIFIED: ResultKind
 RESULT_KIND_DETECTION: ResultKind
 RESULT_KIND_SEGMENTATION: ResultKind
+BACKGROUND_FILL_UNSPECIFIED: BackgroundFill
+BACKGROUND_FILL_ZERO: BackgroundFill
+BACKGROUND_FILL_GREY: BackgroundFill
+BACKGROUND_FILL_MEAN: BackgroundFill
+BACKGROUND_FILL_BLUR: BackgroundFill
+BACKGROUND_FILL_FREEZE: BackgroundFill
+BACKGROUND_FILL_KEEP: BackgroundFill
+CROP_MODE_UNSPECIFIED: CropMode
+CROP_MODE_ROWS: CropMode
+CROP_MODE_BOX: CropMode
+INTERPOLATION_UNSPECIFIED: Interpolation
+INTERPOLATION_CUBIC: Interpolation
+INTERPOLATION_LINEAR: Interpolation
+INTERPOLATION_NEAREST: Interpolation
+INTERPOLATION_LANCZOS: Interpolation
 REJECT_REASON_UNSPECIFIED: RejectReason
 REJECT_REASON_SUPERSEDED: RejectReason
 REJECT_REASON_DEADLINE: RejectReason
@@ -158,18 +203,38 @@ class ModelInfo(_message.Message):
     def __init__(self, name: _Optional[str] = ..., revision: _Optional[str] = ..., result_kind: _Optional[_Union[ResultKind, str]] = ..., device: _Optional[str] = ...) -> None: ...
 
 class CodecConfig(_message.Message):
-    __slots__ = ("codec", "width", "height", "frame_rate", "quality")
+    __slots__ = ("codec", "width", "height", "frame_rate", "quality", "treatment")
     CODEC_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     FRAME_RATE_FIELD_NUMBER: _ClassVar[int]
     QUALITY_FIELD_NUMBER: _ClassVar[int]
+    TREATMENT_FIELD_NUMBER: _ClassVar[int]
     codec: Codec
     width: int
     height: int
     frame_rate: float
     quality: int
-    def __init__(self, codec: _Optional[_Union[Codec, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., frame_rate: _Optional[float] = ..., quality: _Optional[int] = ...) -> None: ...
+    treatment: RegionTreatment
+    def __init__(self, codec: _Optional[_Union[Codec, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., frame_rate: _Optional[float] = ..., quality: _Optional[int] = ..., treatment: _Optional[_Union[RegionTreatment, _Mapping]] = ...) -> None: ...
+
+class RegionTreatment(_message.Message):
+    __slots__ = ("fill", "grid", "crop", "scale", "interpolation", "feather_px", "compose")
+    FILL_FIELD_NUMBER: _ClassVar[int]
+    GRID_FIELD_NUMBER: _ClassVar[int]
+    CROP_FIELD_NUMBER: _ClassVar[int]
+    SCALE_FIELD_NUMBER: _ClassVar[int]
+    INTERPOLATION_FIELD_NUMBER: _ClassVar[int]
+    FEATHER_PX_FIELD_NUMBER: _ClassVar[int]
+    COMPOSE_FIELD_NUMBER: _ClassVar[int]
+    fill: BackgroundFill
+    grid: int
+    crop: CropMode
+    scale: float
+    interpolation: Interpolation
+    feather_px: int
+    compose: bool
+    def __init__(self, fill: _Optional[_Union[BackgroundFill, str]] = ..., grid: _Optional[int] = ..., crop: _Optional[_Union[CropMode, str]] = ..., scale: _Optional[float] = ..., interpolation: _Optional[_Union[Interpolation, str]] = ..., feather_px: _Optional[int] = ..., compose: bool = ...) -> None: ...
 
 class TaskConfig(_message.Message):
     __slots__ = ("prompt", "min_score")
