@@ -13,6 +13,7 @@ from cable_codecs import CodecError
 import cable_rpc
 from cable_rpc.cli.codec_study import codec_study
 from cable_rpc.cli.demo import demo
+from cable_rpc.cli.doctor import doctor
 from cable_rpc.cli.inspect import inspect
 from cable_rpc.cli.serve import serve
 from cable_rpc.cli.stream import stream
@@ -31,6 +32,7 @@ app.command()(stream)
 app.command()(demo)
 app.command()(inspect)
 app.command()(codec_study)
+app.command()(doctor)
 
 
 def _version(wanted: bool) -> None:

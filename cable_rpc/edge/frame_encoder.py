@@ -81,6 +81,11 @@ class FrameEncoder:
         self._last_index: int | None = None
 
     @property
+    def fallback_reason(self) -> str | None:
+        """Why it isn't the encoder that was asked for; None where it is."""
+        return self._encoder.encoder.fallback_reason
+
+    @property
     def rate_status(self) -> StillRateStatus | None:
         """How the rate of an image codec is kept; None without a target."""
         return None if self._rate is None else self._rate.status

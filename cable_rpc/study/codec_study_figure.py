@@ -9,13 +9,16 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from cable_rpc.errors import ConfigurationError
-from cable_rpc.study.codec_compare import ANCHOR_CODEC, MEASURES, StudyResults, Way
+from cable_rpc.study.codec_compare import ANCHOR_CODEC, MEASURES, ClipView, StudyResults, Way
 from cable_rpc.study.codec_study_tables import clips_line
 from cable_rpc.study.report_plots import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RED
 from cable_rpc.study.study_treatments import WHOLE
 
 FIGURE_FILE = "codec_study.html"
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED, "#7db4e0", "#c3a5dd", "#8cc9a8", "#f0be85", "#5b7794", "#b08d57", GREY)
+PLOT_PX, GAP_PX, HEAD_PX = 380, 105, 170
+"""Height of one plot with its gap, the gap between plots, and the room for title and legend."""
+RATE_TICKS = [scale * digit for scale in (1, 10, 100, 1000, 10_000, 100_000) for digit in (1, 2, 5)]
 DASHES = ("solid", "dot", "dash", "dashdot", "longdash")
 
 
@@ -37,9 +40,9 @@ def study_figure(results: StudyResults) -> go.Figure:
     measure = MEASURES["roi_psnr"]
     views, ways = results.views, results.ways
     count = len(views)
-    titles = [clips_line(results, view) for view in views] + ["BD-rate against whole frames in H.264, %"]
-    heights = [*([1.0] * count), 0.8]
-    figure = make_subplots(count + 1, 1, subplot_titles=titles, row_heights=heights, vertical_spacing=0.08)
+    titles = [view_title(results, view) for view in views] + ["<b>BD-rate against whole frames in H.264, %</b>"]
+    height = PLOT_PX * (count + 1) + HEAD_PX
+    figure = make_subplots(count + 1, 1, subplot_titles=titles, vertical_spacing=GAP_PX / (height - HEAD_PX))
     for way, (colour, dash) in styles(ways).items():
         label = f"{way.treatment} · {way.codec}"
         for row, view in enumerate(views, 1):
@@ -77,15 +80,32 @@ def study_figure(results: StudyResults) -> go.Figure:
             col=1,
         )
     for row in range(1, count + 1):
-        figure.update_xaxes(type="log", title="kbit/s, masks included (log)", row=row, col=1)
+        figure.update_xaxes(
+            type="log", title="kbit/s, masks included", tickvals=RATE_TICKS, tickformat="d", row=row, col=1
+        )
         figure.update_yaxes(title="dB inside the region", row=row, col=1)
+    # Titles stand above the left end of their plots, where no width cuts them.
+    figure.update_annotations(x=0, xanchor="left", align="left", font={"size": 13})
     figure.update_layout(
         template="plotly_white",
-        height=420 * (count + 1),
+        height=height,
+        margin={"t": HEAD_PX, "l": 60, "r": 20, "b": 60},
         font={"color": INK, "family": "system-ui, sans-serif"},
-        title="Codec study: bytes against quality inside the region",
+        title={
+            "text": "Codec study: bytes against quality inside the region",
+            "y": 1,
+            "yref": "container",
+            "pad": {"t": 16},
+        },
+        legend={"orientation": "h", "y": 1 - 46 / height, "yref": "container", "yanchor": "top"},
     )
     return figure
+
+
+def view_title(results: StudyResults, view: ClipView) -> str:
+    """A clip's file, and what its regions are, in two short lines."""
+    line = clips_line(results, view).removeprefix(f"{view.clip}: ")
+    return f"<b>{view.title}, region {view.kind}</b><br>{line}"
 
 
 def styles(ways: list[Way]) -> dict[Way, tuple[str, str]]:

@@ -143,7 +143,10 @@ class StreamRun:
         with FrameCsvWriter(config.out / FRAMES_FILE) as csv:
             async with self._session(realtime=config.realtime) as client:
                 self._describe(client)
-                streamer = EdgeStreamer(capture, FrameEncoder(strategy, self._parameters, self._treatment), client)
+                encoder = FrameEncoder(strategy, self._parameters, self._treatment)
+                if encoder.fallback_reason is not None:
+                    self._note(f"Encoder: {encoder.fallback_reason}.")
+                streamer = EdgeStreamer(capture, encoder, client)
                 try:
                     async with aclosing(streamer.run()) as streamed_frames:
                         async for streamed in streamed_frames:
@@ -154,6 +157,7 @@ class StreamRun:
                             self._listener("stream", evidence.record)
                 finally:
                     self._describe(client)
+                    self._note_rate(encoder)
                     self._measured_link = measure_link(config.target)
                     self._unsent = [
                         *(FrameRecord(index, 0, "dropped") for index in capture.dropped),
@@ -212,6 +216,19 @@ class StreamRun:
             clock_offset_ns=offset.offset_ns if offset else None,
             clock_offset_error_ns=offset.error_ns if offset else None,
         )
+
+    def _note(self, text: str) -> None:
+        self._info = replace(self._info, notes=(*self._info.notes, text))
+
+    def _note_rate(self, encoder: FrameEncoder) -> None:
+        status = encoder.rate_status
+        if status is None:
+            return
+        text = f"Image quality followed the rate: {status.mean_kbps:.0f} kbit/s, largest frame "
+        text += f"{1 + status.largest_overshoot:.1f} times its share"
+        if status.frames_at_floor or status.frames_at_ceiling:
+            text += f"; out of reach on {status.frames_at_floor + status.frames_at_ceiling} frames"
+        self._note(text + ".")
 
     def _write(self) -> RunSummary:
         records = [evidence.record for evidence in self._evidence] + self._unsent

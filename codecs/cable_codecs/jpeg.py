@@ -1,7 +1,7 @@
-"""JPEG: OpenCV's libjpeg-turbo encodes, several times faster than FFmpeg and on libjpeg's quality scale; FFmpeg decodes.
+"""JPEG: libjpeg-turbo, by OpenCV, encodes several times faster than FFmpeg; FFmpeg decodes.
 
 OpenCV would decode a third faster, but its libjpeg writes a line about each damaged image straight to the process's
-standard error, where anybody who sends images could fill a log, and takes most damage for a picture.
+standard error, where whoever sends images could fill a log.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class JpegEncoder(Encoder):
 class JpegDecoder(StillDecoder):
     """Decodes sequential 4:2:0 files, those of `JpegEncoder` and others.
 
-    Damage to the scan is noticed where it leaves no valid Huffman code; the rest comes out as a wrong picture. The
-    transport has to keep the bytes right.
+    Damage inside the scan is noticed only where it leaves no valid Huffman code, else it comes out as a wrong picture.
+    The transport has to keep the bytes right.
     """
 
     def __init__(self, parameters: CodecParameters) -> None:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from cable_codecs.errors import CodecError
 
 START_OF_IMAGE = b"\xff\xd8"
 END_OF_IMAGE = b"\xff\xd9"
 START_OF_SCAN = 0xDA
+HUFFMAN_TABLES = 0xC4
+QUANTISER_TABLES = 0xDB
 SEQUENTIAL_FRAMES = (0xC0, 0xC1)
 """SOF0 and SOF1: baseline and extended sequential, Huffman coded."""
+AC_CLASS = 0x10
+"""Table class bit of Huffman tables for AC values."""
 OTHER_FRAMES = frozenset({0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF})
 SUBSAMPLED_420 = (3, 0x22, 0x11, 0x11)
 """Number of components, then the sampling factors of each."""
@@ -17,7 +23,8 @@ SUBSAMPLED_420 = (3, 0x22, 0x11, 0x11)
 def check_jpeg(data: bytes, size: tuple[int, int], name: str) -> None:
     """Check that a file is one whole JPEG of a size: sequential, 8 bits, 4:2:0 (ITU-T T.81, annex B).
 
-    Damage inside the scan stays unseen.
+    It must bring the tables that its first scan needs, since FFmpeg would put others in their place. Damage inside
+    the scan stays unseen.
 
     Args:
         data: The file.
@@ -28,7 +35,8 @@ def check_jpeg(data: bytes, size: tuple[int, int], name: str) -> None:
         CodecError: Cut, trailing bytes, another size or pixel format, or not a JPEG.
     """
     position = 2
-    seen_frame = False
+    needed: set[tuple[int, int]] = set()
+    tables: set[tuple[int, int]] = set()
     if data[:2] != START_OF_IMAGE:
         raise not_whole(data, name)
     while True:
@@ -43,11 +51,32 @@ def check_jpeg(data: bytes, size: tuple[int, int], name: str) -> None:
             raise CodecError(f"{name} file is progressive or arithmetic coded; encode it as baseline")
         if marker in SEQUENTIAL_FRAMES:
             check_jpeg_frame(segment, size, name)
-            seen_frame = True
+            needed = {(QUANTISER_TABLES, index) for index in segment[8::3]}
+        if marker in (HUFFMAN_TABLES, QUANTISER_TABLES):
+            tables |= {(marker, index) for index in table_indices(marker, segment)}
         if marker == START_OF_SCAN:
             break
-    if not seen_frame or data.find(END_OF_IMAGE, position) != len(data) - 2:
+    if not needed or data.find(END_OF_IMAGE, position) != len(data) - 2:
         raise not_whole(data, name)
+    # Of each component in the scan: its identifier, then four bits for its DC and four for its AC table.
+    for both in segment[2 : 2 + 2 * segment[0] : 2] if segment else b"":
+        needed |= {(HUFFMAN_TABLES, both >> 4), (HUFFMAN_TABLES, AC_CLASS | both & 15)}
+    if not needed <= tables:
+        raise CodecError(f"{name} file of {len(data)} bytes lacks some of its tables; send the whole file")
+
+
+def table_indices(marker: int, segment: bytes) -> Iterator[int]:
+    """The destination identifiers of the tables in a segment, with `AC_CLASS` for the Huffman codes of AC values."""
+    position = 0
+    while position < len(segment):
+        head = segment[position]
+        if marker == QUANTISER_TABLES:
+            yield head & 15
+            # 64 values of 8 or 16 bits.
+            position += 1 + 64 * (1 + (head >> 4))
+        else:
+            yield head
+            position += 17 + sum(segment[position + 1 : position + 17])
 
 
 def check_jpeg_frame(segment: bytes, size: tuple[int, int], name: str) -> None:

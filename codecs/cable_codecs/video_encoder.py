@@ -104,7 +104,7 @@ class VideoEncoder(Encoder):
         frame = frame_for(self.spec, self.to_picture(image), self.video.coded_size(self.parameters))
         frame.pts = self.frame_count
         if self.attacher is not None:
-            # libx265 writes beyond its memory where offsets come with some frames and not with the first.
+            # libx265 crashes where offsets come with later frames and not with the first.
             frame = self.attacher.attach(frame, self.everything if roi is None else roi)
             frame.pts = self.frame_count
         # Explicit also where none is asked for: frames that come from a decoder carry its picture types.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from fractions import Fraction
 
 import av
@@ -221,3 +223,41 @@ def test_still_quality_is_not_ignored(name):
         encoder.set_quality(quality)
         live.append(len(encoder.encode(image).data))
     assert live == sizes
+
+
+REGION_NOW_AND_THEN = """
+import sys
+import numpy as np
+from cable_codecs import CodecParameters, create_decoder, create_encoder
+
+name, pattern = sys.argv[1], sys.argv[2]
+height, width = 112, 192
+image = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+region = np.zeros((height, width), np.bool_)
+region[32:64, 32:96] = True
+parameters = CodecParameters(name, width, height, quality=30, background_offset=0.1)
+with create_encoder(parameters) as encoder, create_decoder(parameters) as decoder:
+    for number in range(12):
+        roi = region if pattern[number % len(pattern)] == "r" else None
+        packet = encoder.encode(np.roll(image, number, axis=1), roi, keyframe=number == 9)
+        assert decoder.decode(packet.data).shape == image.shape
+print("done")
+"""
+
+
+@pytest.mark.parametrize("name", ["h264", "hevc", "vp9"])
+@pytest.mark.parametrize("pattern", ["-r", "r-", "-rr", "--rrrr"])
+def test_regions_may_come_with_some_frames_only(name, pattern):
+    """libx265 crashes the process where offsets come with two frames running and not with the first."""
+    command = [sys.executable, "-X", "faulthandler", "-c", REGION_NOW_AND_THEN, name, pattern]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("name", ["h264", "hevc", "vp9"])
+def test_no_region_is_all_of_the_frame(name):
+    clip = moving_clip(6)
+    parameters = CodecParameters(name, 128, 96, background_offset=0.3)
+    without, everything = create_encoder(parameters), create_encoder(parameters)
+    for image in clip:
+        assert without.encode(image).data == everything.encode(image, np.ones((96, 128), np.bool_)).data

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -117,7 +118,7 @@ def test_transport_says_where_its_figure_is_from(source: TransportSource) -> Non
     info = replace(INFO, transport_uplink_bytes=9_000 if known else None, transport_source=source)
     summary = summarise(RECORDS, info)
     assert (summary.layer("transport").byte_saving is None) == (source != "estimate")
-    console = Console(width=100, record=True, quiet=True)
+    console = Console(width=100, file=io.StringIO(), record=True)
     console.print(render_summary(summary))
     text = console.export_text()
     assert f"transport ({source})" in text

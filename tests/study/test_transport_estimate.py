@@ -13,7 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cable_rpc.study.transport_counters import carried_bytes, measure_link, open_connections, plain_address
+from cable_rpc.study import transport_counters
+from cable_rpc.study.transport_counters import (
+    Connection,
+    carried_bytes,
+    measure_link,
+    open_connections,
+    plain_address,
+)
 from cable_rpc.study.transport_estimate import TransportBytes, estimate_exchange, estimate_exchanges
 
 QUIET_NETWORK = Path(__file__).with_name("quiet_network_exchange.py")
@@ -103,6 +110,23 @@ def test_headers_by_ip_version_and_time_stamps() -> None:
     info[5] = 1
     assert carried_bytes(bytes(info), ip_version=4) == TransportBytes(900 + 3 * 52, 700 + 2 * 52)
     assert carried_bytes(bytes(info), ip_version=6) == TransportBytes(900 + 3 * 72, 700 + 2 * 72)
+
+
+@pytest.mark.parametrize(
+    ("local", "peer", "link"),
+    [
+        ("192.0.2.1", "192.0.2.7", True),
+        ("192.0.2.1", "192.0.2.1", False),
+        ("127.0.0.1", "127.0.0.2", False),
+        ("::1", "::1", False),
+        ("2001:db8::1", "2001:db8::2", True),
+    ],
+)
+def test_one_machine_is_no_link(local: str, peer: str, link: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    carried = TransportBytes(100, 10)
+    both = [Connection(local, peer, carried), Connection(local, peer, carried)]
+    monkeypatch.setattr(transport_counters, "open_connections", lambda target: both)
+    assert measure_link("any:1") == (TransportBytes(200, 20) if link else None)
 
 
 @pytest.mark.parametrize("target", ["", "unix:/run/x.sock", "dns:///host", "127.0.0.1:1", "no.such.host.invalid:5"])
