@@ -177,7 +177,7 @@ def extras_table(extras: Sequence[Extra]) -> Table:
                 else requirement.package
                 for requirement in extra.missing
             )
-            table.add_row(extra.name, Text(share, style="yellow"), Text(f"{lacking}: {extra.command}"))
+            table.add_row(extra.name, Text(share, style="yellow"), Text(f"{lacking}\n→ {extra.command}"))
     if not extras:
         table.add_row("unknown", "", "cable-rpc runs without being installed: pip install -e .")
     return table

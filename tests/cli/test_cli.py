@@ -43,7 +43,7 @@ def test_help_teaches(command: str) -> None:
     [
         (["stream", "--source", "nonsense"], "can't open source 'nonsense': known are synthetic:..., video:..."),
         (["stream", "--source", "video:absent.mp4"], "absent.mp4"),
-        (["stream", "--source", "synthetic:1", "--codec", "theora"], "use h264, jpeg or webp"),
+        (["stream", "--source", "synthetic:1", "--codec", "theora"], "use one of h264"),
         (["stream", "--source", "synthetic:1", "--size", "big"], "WIDTHxHEIGHT"),
         (["stream", "--source", "synthetic:1", "--pace", "fast"], "lockstep or realtime"),
         (["serve", "--detector", "yolo:x"], "no detector back end is called 'yolo'"),
