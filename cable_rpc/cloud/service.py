@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import grpc
+from cable_codecs import available_codecs
 from google.rpc import code_pb2, status_pb2
 
 import cable_rpc
@@ -74,7 +75,7 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
         return pb.GetServerInfoResponse(
             protocol_revision=PROTOCOL_REVISION,
             server_version=f"cable-rpc/{cable_rpc.__version__}",
-            codecs=list(CODEC_NAMES),
+            codecs=[number for number, name in CODEC_NAMES.items() if name in available_codecs()],
             models=model_infos(self._models),
             flow=self._config.limits.flow(),
             max_pixels=self._config.limits.max_pixels,

@@ -24,7 +24,7 @@ FLAGS = {
     "cubic": cv2.INTER_CUBIC,
     "lanczos": cv2.INTER_LANCZOS4,
 }
-REACH = {"nearest": 0, "linear": 1, "cubic": 2, "lanczos": 4}
+REACH = {"nearest": 1, "linear": 1, "cubic": 2, "lanczos": 4}
 """Uploaded pixels beyond a region's own that enlarging it reads, on each side."""
 
 

@@ -150,13 +150,14 @@ def test_jpeg_without_a_segment_it_needs_is_refused(marker):
         create_decoder(CodecParameters("jpeg", 64, 48)).decode(data[:start] + data[start + length :])
 
 
-def test_jpeg_comments_leave_nothing_behind():
-    """FFmpeg takes this one for a limited range, in the images that follow as well."""
+@pytest.mark.parametrize("comment", [b"CS=ITU601", b"Intel(R) JPEG Library, version 1"])
+def test_jpeg_comments_leave_nothing_behind(comment):
+    """FFmpeg takes one for a limited range, the other for a picture upside down, in the images that follow as well."""
     data = PACKETS["jpeg"]
     scan = marker_positions(data)[0xDA]
     decoder = create_decoder(CodecParameters("jpeg", 64, 48))
     picture = decoder.decode(data)
-    decode_or_refuse(decoder, data[:scan] + b"\xff\xfe\x00\x0bCS=ITU601" + data[scan:])
+    decode_or_refuse(decoder, data[:scan] + b"\xff\xfe" + (len(comment) + 2).to_bytes(2, "big") + comment + data[scan:])
     assert np.array_equal(decoder.decode(data), picture)
 
 
