@@ -62,11 +62,6 @@ class ViewWarp:
         """What holds above the horizon."""
         return self.ground if self.far is None else self.far
 
-    @property
-    def shift_px(self) -> float:
-        """Entry [0, 2] of ``ground``: the shift to the right, in pixels, of a pure translation."""
-        return float(self.ground[0, 2])
-
     def centre_shift_px(self, size_hw: tuple[int, int]) -> float:
         """How far the point at a picture's centre moves to the right, in pixels; NaN where it leaves the camera's view.
 

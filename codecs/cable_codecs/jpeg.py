@@ -89,20 +89,3 @@ class JpegDecoder(StillDecoder):
             # 1280x720.
             self.context = open_decoder(self.still.decoder, self.parameters)
         return super().decode(data)
-
-
-def decode_with_opencv(data: bytes, parameters: CodecParameters) -> Image:
-    """The BGR image of a file whose size has been checked.
-
-    Raises:
-        CodecError: OpenCV can't decode it or finds another size.
-    """
-    try:
-        # Orientation tags would turn the picture.
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error as error:
-        raise CodecError(f"{parameters.name} file of {len(data)} bytes can't be decoded: {error}") from error
-    if image is None or image.shape != (parameters.height, parameters.width, 3) or image.dtype != np.uint8:
-        raise CodecError(f"{parameters.name} file of {len(data)} bytes can't be decoded; it is damaged")
-    return np.asarray(image, np.uint8)

@@ -12,7 +12,6 @@ from av.video.frame import VideoFrame
 from cable_codecs.base import BoolMask, CodecParameters, Decoder, EncodedFrame, Encoder, Image, check_frame
 from cable_codecs.errors import CodecError
 from cable_codecs.ffmpeg import encode_single, open_encoder
-from cable_codecs.jpeg import decode_with_opencv
 from cable_codecs.still import webp_method
 from cable_codecs.still_container import check_lossless_webp
 
@@ -85,3 +84,20 @@ class LosslessWebpDecoder(Decoder):
     def close(self) -> None:
         """Release the codec."""
         self.closed = True
+
+
+def decode_with_opencv(data: bytes, parameters: CodecParameters) -> Image:
+    """The BGR image of a file whose size has been checked.
+
+    Raises:
+        CodecError: OpenCV can't decode it or finds another size.
+    """
+    try:
+        # Orientation tags would turn the picture.
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise CodecError(f"{parameters.name} file of {len(data)} bytes can't be decoded: {error}") from error
+    if image is None or image.shape != (parameters.height, parameters.width, 3) or image.dtype != np.uint8:
+        raise CodecError(f"{parameters.name} file of {len(data)} bytes can't be decoded; it is damaged")
+    return np.asarray(image, np.uint8)

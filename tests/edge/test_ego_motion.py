@@ -88,7 +88,7 @@ def test_unknown_ego_or_camera_is_identity(known):
 
 def test_paper_blows_up_at_standstill():
     step = ego_step(EgoMotion(0.0, 0.02), CAMERA, None, 0.1, PAPER, 1600)
-    assert step.warp.shift_px == pytest.approx(-2e6)
+    assert step.warp.ground[0, 2] == pytest.approx(-2e6)
     assert (step.model, step.clamped) == ("paper", False)
     assert not warp_mask(np.ones((5, 9), np.bool_), step.warp).any()
 
@@ -96,9 +96,9 @@ def test_paper_blows_up_at_standstill():
 def test_shift_is_clamped():
     config = RoiConfig(ego_model="paper", max_shift_share=0.05)
     step = ego_step(EgoMotion(10.0, 3.0), CAMERA, None, 0.1, config, 1600)
-    assert (step.warp.shift_px, step.clamped) == (-80.0, True)
+    assert (step.warp.ground[0, 2], step.clamped) == (-80.0, True)
     step = ego_step(EgoMotion(10.0, 0.3), CAMERA, None, 0.1, config, 1600)
-    assert (step.warp.shift_px, step.clamped) == (pytest.approx(-30.0), False)
+    assert (step.warp.ground[0, 2], step.clamped) == (pytest.approx(-30.0), False)
     assert not step.then(EgoStep()).clamped
     assert EgoStep(clamped=True).then(step).clamped
 
@@ -158,7 +158,7 @@ def test_step_measures_metres_and_degrees(model):
 
 def test_paper_shifts_add_up():
     step = ego_step(EgoMotion(3.0, 4.0), CAMERA, None, 0.1, PAPER, 1600)
-    assert step.then(step).warp.shift_px == pytest.approx(2 * step.warp.shift_px)
+    assert step.then(step).warp.ground[0, 2] == pytest.approx(2 * step.warp.ground[0, 2])
 
 
 # --- rotation and ground plane ------------------------------------------------------------------------

@@ -152,7 +152,7 @@ def test_scaled_warp_moves_the_same_points():
         assert (a / c, b / c) == pytest.approx(((u / w + 0.5) / 4 - 0.5, (v / w + 0.5) / 4 - 0.5))
     assert small.horizon_row == pytest.approx((warp.horizon_row + 0.5) / 4 - 0.5)
     assert warp.scaled(1) is warp
-    assert shift(10.0).scaled(0.25).shift_px == 2.5
+    assert shift(10.0).scaled(0.25).ground[0, 2] == 2.5
     assert ViewWarp().scaled(0.25).is_identity
 
 
@@ -162,7 +162,7 @@ def test_plain_and_split_warps_compose():
         assert np.array_equal(both.far, far)
         assert both.horizon_row == road.horizon_row
     assert plain.then(plain).far is None
-    assert plain.then(plain).shift_px == 4.0
+    assert plain.then(plain).ground[0, 2] == 4.0
 
 
 # --- actors -------------------------------------------------------------------------------------------
