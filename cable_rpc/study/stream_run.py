@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import platform
 import shutil
-from collections.abc import AsyncGenerator, Callable, Iterable, Iterator
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from cable_codecs import STILL_CODECS, CodecParameters, RegionTreatment, default_quality
 
@@ -172,7 +173,7 @@ class StreamRun:
             async with aclosing(self._whole_frames()) as whole_frames:
                 position = 0
                 async for whole in whole_frames:
-                    evidence = await asyncio.to_thread(evaluator.judge, self._evidence[position], whole)
+                    evidence = await _to_its_end(asyncio.to_thread(evaluator.judge, self._evidence[position], whole))
                     self._evidence[position] = evidence
                     position += 1
                     self._listener("evaluate", evidence.record)
@@ -258,6 +259,16 @@ def _with_transport(info: RunInfo, records: Iterable[FrameRecord], measured: Tra
         transport_downlink_bytes=carried.downlink,
         transport_source="measured" if measured else "estimate",
     )
+
+
+async def _to_its_end(work: Coroutine[Any, Any, FrameEvidence]) -> FrameEvidence:
+    """Awaits a thread's work; a cancellation waits for it too, for the thread can't be stopped and holds the codecs."""
+    task = asyncio.ensure_future(work)
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.wait([task])
+        raise
 
 
 def _only(source: Iterable[Frame], indices: set[int]) -> Iterator[Frame]:
