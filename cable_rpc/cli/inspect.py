@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from cable_rpc.cli.roi_options import MODES, roi_config
-from cable_rpc.cli.stream import centred_intrinsics, parse_size
+from cable_rpc.cli.stream import camera_mount, centred_intrinsics, parse_size
 from cable_rpc.cloud.backends import BackendOptions, load_detector
 from cable_rpc.cloud.segmenters import RandomAccessSource
 from cable_rpc.data.source import FrameSource, open_source
@@ -66,6 +66,10 @@ def inspect(
     focal: Annotated[
         float | None, typer.Option(help="Focal length of the video's camera in pixels, for the ego-motion warp.")
     ] = None,
+    camera_height: Annotated[
+        float | None, typer.Option(help="Metres from the road to the video's camera, for the ground-plane warp.")
+    ] = None,
+    camera_pitch: Annotated[float, typer.Option(help="Degrees by which that camera looks below the horizontal.")] = 0.0,
     block_size: Annotated[int, typer.Option(help="Grid that the region is grown to; 1 = exact.", min=1)] = 8,
 ) -> None:
     """Show how one frame's region of interest came about: every step of the method, labelled, on one sheet.
@@ -88,7 +92,12 @@ def inspect(
         raise ConfigurationError("--roi changes the robust mode, which --mode paper leaves out; use robust or both")
     answering, told = cloud_model(cloud, detector, min_score)
     opened = open_source(
-        source, ego_csv=ego_csv, size=parse_size(size), intrinsics=centred_intrinsics(focal, source), fps=fps
+        source,
+        ego_csv=ego_csv,
+        size=parse_size(size),
+        intrinsics=centred_intrinsics(focal, source),
+        fps=fps,
+        mount=camera_mount(camera_height, camera_pitch),
     )
     first = max(0, frame - lead_in)
     frames = window(opened, first, frame)

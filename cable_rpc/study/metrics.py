@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from cable_rpc.edge import refresh
 from cable_rpc.types import CLASS_GROUPS, BoolMask, Detections, Float32Array, GroundTruth, Int32Array
 
 Float64Array = npt.NDArray[np.float64]
@@ -219,8 +220,7 @@ def visible_truth(
 
 def mask_iou(mask_a: BoolMask, mask_b: BoolMask) -> float:
     """Intersection over union of two bool [height, width] masks; 1 where both are empty."""
-    union = int(np.count_nonzero(mask_a | mask_b))
-    return int(np.count_nonzero(mask_a & mask_b)) / union if union else 1.0
+    return refresh.mask_iou(mask_a, mask_b, empty_masks_agree=True)
 
 
 def pixel_saving(coverage: float) -> float:

@@ -52,6 +52,8 @@ class TreatedEncoder:
 
     def __init__(self, parameters: CodecParameters, treatment: RegionTreatment) -> None:
         coded = coded_parameters(parameters, treatment)
+        # Other encoders would only check the mask's shape, and making it costs time.
+        self.heeds_region = parameters.name in STILL_CODECS or treatment.quantiser_offset > 0
         self.sender = RegionSender(treatment, parameters.height, parameters.width)
         self.encoder: Encoder = create_encoder(coded) if treatment.crop == "none" else SizedEncoder(coded)
 
@@ -72,7 +74,8 @@ class TreatedEncoder:
         started_ns = time.monotonic_ns()
         treated = self.sender.treat(image, blocks, block_size, keyframe=keyframe)
         treat_ns = time.monotonic_ns() - started_ns
-        encoded = self.encoder.encode(treated.image, treated.encoder_roi(), keyframe=keyframe)
+        roi = treated.encoder_roi() if self.heeds_region else None
+        encoded = self.encoder.encode(treated.image, roi, keyframe=keyframe)
         return TreatedPacket(encoded, treated.blocks, treated.block_size, treat_ns)
 
     def set_quality(self, quality: int) -> None:
