@@ -14,7 +14,7 @@ from cable_models.lisa import load_lisa
 from cable_models.lisa.architecture import ClipPreprocessing, projector_depth, read_architecture, read_clip_config
 from cable_models.lisa.sam_sizes import SAM_PREFIX, read_sam_sizes, sam_sizes_of
 from cable_models.lisa.saver import save_lisa
-from cable_models.lisa.special_tokens import SpecialTokens
+from cable_models.lisa.special_tokens import SpecialTokens, read_special_tokens
 from lisa_checkpoints import (
     GOLDEN,
     UNLIKE_SAM,
@@ -67,7 +67,7 @@ def test_unlike_sizes_follow_from_the_tensors(unlike: Path) -> None:
 def test_sidecar_gives_what_shapes_cannot(unlike: Path) -> None:
     shapes = stored_shapes(unlike)
     assert read_sam_sizes(shapes, {"decoder_num_heads": 4}).decoder_num_heads == 4
-    with pytest.raises(ModelError, match="5 heads don't divide the mask decoder's 8 attention channels"):
+    with pytest.raises(ModelError, match="5 heads don't divide the mask decoder's 24 attention channels"):
         read_sam_sizes(shapes, {"decoder_num_heads": 5})
 
 
@@ -101,7 +101,7 @@ def test_window_as_wide_as_the_grid_is_global_attention(unlike: Path) -> None:
     """Either layout gives the same tables and the same numbers, so the sidecar's word is taken."""
     shapes = stored_shapes(unlike)
     block = f"{SAM_PREFIX}image_encoder.blocks.1.attn.rel_pos_"
-    shapes |= {f"{block}h": (23, 16), f"{block}w": (23, 16)}
+    shapes |= {f"{block}h": (23, 20), f"{block}w": (23, 20)}
     assert read_sam_sizes(shapes).global_attn_indexes == (0, 1, 2)
     said = {"window_size": 12, "global_attn_indexes": [2]}
     assert read_sam_sizes(shapes, said).global_attn_indexes == (2,)
@@ -110,13 +110,13 @@ def test_window_as_wide_as_the_grid_is_global_attention(unlike: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "shape", "told"),
     [
-        ("image_encoder.pos_embed", (1, 12, 14, 48), "12x14"),
+        ("image_encoder.pos_embed", (1, 12, 14, 60), "12x14"),
         ("image_encoder.pos_embed", (12, 12), "4 dimensions were expected"),
         ("image_encoder.pos_embed", None, "which gives SAM's sizes"),
         ("image_encoder.blocks.1.attn.rel_pos_h", None, "blocks.1.attn.rel_pos_h"),
-        ("image_encoder.blocks.0.attn.rel_pos_h", (7, 16), r"\[7, 9\] rows"),
+        ("image_encoder.blocks.0.attn.rel_pos_h", (7, 20), r"\[7, 9\] rows"),
         ("image_encoder.blocks.0.attn.rel_pos_h", (23, 7), "7 channels"),
-        ("mask_decoder.transformer.final_attn_token_to_image.q_proj.weight", (7, 24), "no whole fraction"),
+        ("mask_decoder.transformer.final_attn_token_to_image.q_proj.weight", (7, 48), "7 channels isn't half"),
     ],
 )
 def test_impossible_shapes(name: str, shape: tuple[int, ...] | None, told: str, unlike: Path) -> None:
@@ -137,11 +137,12 @@ def test_checkpoint_without_sam() -> None:
     ("changes", "told"),
     [
         ({"hidden_size": 48}, "hidden_size 48"),
-        ({"out_dim": 256}, "out_dim 256, but model.text_hidden_fcs.0.2.weight has 24 rows"),
+        ({"out_dim": 256}, "out_dim 256, but model.text_hidden_fcs.0.2.weight has 48 rows"),
         ({"mm_projector_type": "mlp2x_gelu"}, "'mlp2x_gelu', but the tensors are those of 'linear'"),
         ({"mm_vision_select_feature": "cls"}, "neither 'patch' nor 'cls_patch'"),
         ({"mm_vision_select_layer": 7}, "5 hidden states"),
         ({"num_attention_heads": None}, "num_attention_heads"),
+        ({"mm_projector_type": "identity"}, "'identity'"),
     ],
 )
 def test_contradicting_configuration(changes: dict[str, Any], told: str, unlike: Path) -> None:
@@ -230,13 +231,25 @@ def test_half_precision_on_request(tmp_path: Path) -> None:
     assert torch.equal(loaded.lm_head.weight, model.lm_head.weight.half())
 
 
+def test_tokenizer_files_are_copied(tmp_path: Path) -> None:
+    source = tmp_path / "tokenizer"
+    source.mkdir()
+    for name in ("tokenizer.model", "added_tokens.json", "notes.txt"):
+        (source / name).write_text(name)
+    model = unlike_model()
+    folder = save_lisa(model, model.architecture, tmp_path / "new", TOKENS, tokenizer_folder=source)
+    assert (folder / "tokenizer.model").read_text() == "tokenizer.model"
+    assert (folder / "added_tokens.json").exists()
+    assert not (folder / "notes.txt").exists()
+
+
 def test_saving_leaves_nothing_half_done(tmp_path: Path) -> None:
     model = unlike_model()
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "notes.txt").write_text("mine")
     with pytest.raises(ModelError, match="isn't an empty folder"):
         save_lisa(model, model.architecture, tmp_path / "taken", TOKENS)
-    with pytest.raises(ModelError, match="no tokenizer.model to save"):
+    with pytest.raises(ModelError, match=r"no tokenizer\.model to save"):
         save_lisa(model, model.architecture, tmp_path / "new", TOKENS, tokenizer_folder=tmp_path)
     with pytest.raises(ModelError, match="can't be written"):
         save_lisa(model, model.architecture, tmp_path / "absent" / "new", TOKENS)
@@ -247,8 +260,6 @@ def test_saving_leaves_nothing_half_done(tmp_path: Path) -> None:
 
 
 def test_tokens_by_name(unlike: Path, tmp_path: Path) -> None:
-    from cable_models.lisa.special_tokens import read_special_tokens
-
     (tmp_path / "tokenizer_config.json").write_text(
         json.dumps({"added_tokens_decoder": {"0": {"content": "<unk>"}, "40": {"content": "[SEG]"}}})
     )
@@ -259,7 +270,7 @@ def test_tokens_by_name(unlike: Path, tmp_path: Path) -> None:
     assert read_special_tokens(tmp_path, {}) == SpecialTokens(seg=41, im_start=42, im_end=43)
     (tmp_path / "tokens.json").write_text(json.dumps({"seg_token_idx": 7, "im_start_id": None}))
     assert read_special_tokens(tmp_path, {}) == SpecialTokens(seg=7)
-    edit_json(tmp_path / "tokens.json", seg_token_idx="7")
+    (tmp_path / "tokens.json").write_text(json.dumps({"seg_token_idx": "7"}))
     with pytest.raises(ModelError, match="no token ids"):
         read_special_tokens(tmp_path, {})
     with pytest.raises(ModelError, match=r"no \[SEG\] among the added tokens"):

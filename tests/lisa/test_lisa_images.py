@@ -80,6 +80,20 @@ def test_crop_equals_transformers(frame: tuple[int, int]) -> None:
     np.testing.assert_array_equal(tensor, transformers_clip(PilImage.fromarray(bgr[..., ::-1].copy()), 56))
 
 
+@given(st.integers(1, 130), st.integers(1, 130), st.integers(1, 40))
+@settings(max_examples=60, deadline=None)
+def test_crop_at_any_size_is_pil_bicubic_rows_first(height: int, width: int, size: int) -> None:
+    """The passes are given to PIL one by one: for few pixels Pillow 13 turns them round, the authors' didn't."""
+    from transformers.image_transforms import get_resize_output_image_size
+
+    bgr = random_frame(height, width)
+    tensor = clip_input(bgr, clip_geometry((height, width), size))
+    rows, columns = get_resize_output_image_size(bgr, size, default_to_square=False, input_data_format="channels_last")
+    rgb, bicubic = PilImage.fromarray(bgr[..., ::-1].copy()), PilImage.Resampling.BICUBIC
+    resized = rgb.resize((columns, height), bicubic).resize((columns, rows), bicubic)
+    np.testing.assert_array_equal(tensor, transformers_clip(resized, size))
+
+
 @pytest.mark.parametrize("frame", FRAMES)
 def test_pad_equals_llavas_square(frame: tuple[int, int]) -> None:
     bgr = random_frame(*frame)
@@ -113,11 +127,12 @@ def test_frame_may_be_a_view_and_is_left_alone() -> None:
     np.testing.assert_array_equal(whole, before)
 
 
-@pytest.mark.parametrize("frame", [(180, 320), (320, 180), (57, 91), (20, 33), (64, 64)])
+@pytest.mark.parametrize("frame", [(180, 320), (320, 180), (57, 91), (20, 33), (33, 3), (64, 64)])
 def test_sam_input_is_pil_bilinear_normalised_then_padded(frame: tuple[int, int]) -> None:
     bgr = random_frame(*frame)
     tensor, (height, width) = sam_input(bgr, 64)
-    resized = PilImage.fromarray(bgr[..., ::-1].copy()).resize((width, height), PilImage.Resampling.BILINEAR)
+    rgb, bilinear = PilImage.fromarray(bgr[..., ::-1].copy()), PilImage.Resampling.BILINEAR
+    resized = rgb.resize((width, frame[0]), bilinear).resize((width, height), bilinear)
     expected = np.zeros((64, 64, 3), np.float32)
     expected[:height, :width] = (np.asarray(resized).astype(np.float32) - np.float32(SAM_MEAN)) / np.float32(SAM_STD)
     np.testing.assert_array_equal(tensor, expected.transpose(2, 0, 1))

@@ -158,8 +158,11 @@ def test_kept_windows_are_exact_up_to_the_first_global_block(frame: str, padding
 
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("windows", ["all", "skip", "tokens"])
-def test_partial_encoding_is_the_network_with_the_other_tokens_hidden(frame: str, windows: str) -> None:
-    sam = small_sam()
+@pytest.mark.parametrize("vision", [{}, {"use_rel_pos": False}], ids=str)
+def test_partial_encoding_is_the_network_with_the_other_tokens_hidden(
+    frame: str, windows: str, vision: dict[str, object]
+) -> None:
+    sam = small_sam(**vision)
     pixels, plan = pictures(sam, 1), plan_of(sam, frame, "drop", windows)
     found = encode(sam.vision_encoder, pixels, [plan])
     expected = masked_encoder(sam.vision_encoder, pixels[0], torch.from_numpy(plan.tokens))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from cable_models.errors import ModelError
+from cable_models.lisa.loader import load_lisa
 from cable_models.lisa.mask_decoder import (
     OUTSIDE_LOGIT,
     PROMPTS_AT_ONCE,
@@ -17,11 +18,13 @@ from cable_models.lisa.mask_decoder import (
     dense_positional_embedding,
     upsample_logits,
 )
-from cable_models.lisa.sam_encoder import FrameFeatures, SamFeatures
+from cable_models.lisa.sam_encoder import FrameFeatures, SamFeatures, encode_tokens, grid_of
+from cable_models.lisa.sam_plan import SamPlan
 from torch import Tensor
 from transformers import SamConfig, SamModel
 
-GOLDEN = Path(__file__).resolve().parents[3] / "shared" / "golden" / "lisa_tiny_a"
+GOLDENS = Path(__file__).resolve().parents[3] / "shared" / "golden"
+FOLDERS = sorted(path for path in GOLDENS.glob("lisa_*") if (path / "outputs_forced.npz").is_file())
 SIDE, WIDTH = 8, 16
 
 
@@ -145,17 +148,37 @@ def test_enlarging_does_not_erode_a_mask_that_fills_the_kept_region() -> None:
     assert (high[torch.from_numpy(beyond)] < 0).all()
 
 
+@pytest.mark.skipif(not FOLDERS, reason=f"no reference tensors of the original code in {GOLDENS}")
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
 @pytest.mark.parametrize("name", ["forced", "generate"])
-def test_enlarged_logits_are_the_originals(name: str) -> None:
-    if not GOLDEN.exists():
-        pytest.skip("needs the stored tensors in ../shared/golden/lisa_tiny_a")
-    inputs, outputs = np.load(GOLDEN / "inputs.npz"), np.load(GOLDEN / f"outputs_{name}.npz")
+def test_enlarged_logits_are_the_originals(folder: Path, name: str) -> None:
+    inputs, outputs = np.load(folder / "inputs.npz"), np.load(folder / f"outputs_{name}.npz")
     frame_hw, resized_hw = (tuple(inputs[key].tolist()) for key in ("original_size", "resize_size"))
     low_res = torch.from_numpy(outputs["low_res_masks"])
     found = upsample_logits(low_res, resized_hw, frame_hw, inputs["images_sam"].shape[-1])
     assert found.dtype == torch.float32
     np.testing.assert_allclose(found.numpy(), outputs["mask_logits"], rtol=0, atol=1e-5)
     assert np.array_equal(found.numpy() > 0, outputs["masks"])
+
+
+@pytest.mark.skipif(not FOLDERS, reason=f"no reference tensors of the original code in {GOLDENS}")
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
+def test_a_list_of_all_tokens_gives_the_originals_masks(folder: Path) -> None:
+    """The way of partial frames, on every token: encoder, neck, decoder and scattering against the stored tensors."""
+    network = load_lisa(str(folder), dtype=torch.float32).model.sam
+    inputs, outputs = np.load(folder / "inputs.npz"), np.load(folder / "outputs_forced.npz")
+    grid = grid_of(network.vision_encoder)
+    every = SamPlan(grid, np.ones((grid.side, grid.side), np.bool_))
+    with torch.inference_mode():
+        pixels = torch.from_numpy(inputs["images_sam"])
+        features = SamFeatures(tuple(encode_tokens(network.vision_encoder, pixels, {0: every})), grid.side)
+        masks = decode_masks(network, features, [torch.from_numpy(outputs["seg_embeddings"])])[0].numpy()
+    embedding = np.load(folder / "shared_features.npz")["sam_image_embedding"][0]
+    assert features.frames[0].indexes is not None
+    expected = embedding.reshape(len(embedding), -1).T[features.frames[0].indexes.numpy()]
+    np.testing.assert_allclose(features.frames[0].values.numpy(), expected, rtol=0, atol=1e-4 * abs(expected).max())
+    stored = outputs["low_res_masks"][:, 0]
+    np.testing.assert_allclose(masks, stored, rtol=0, atol=1e-4 * abs(stored).max())
 
 
 def test_enlarging_half_precision_and_nothing() -> None:

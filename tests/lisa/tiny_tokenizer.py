@@ -28,6 +28,7 @@ LLAMA_WORDS = {
     "▁the": 278,
     "▁and": 322,
     "▁Sure": 18585,
+    "▁Hello": 15043,
     "▁result": 1121,
     "▁segment": 10768,
     "ation": 362,

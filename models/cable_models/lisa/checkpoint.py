@@ -76,7 +76,7 @@ def fetch(name: str, revision: str | None = None) -> Path:
         if not any((folder / weights).is_file() for weights in WEIGHT_FILES[:2]):
             folder = Path(snapshot_download(name, revision=revision, allow_patterns=["pytorch_model*.bin"]))
     except (HfHubHTTPError, OSError, ValueError) as error:
-        raise ModelError(f"{name} can't be fetched from the hub ({error}); {LAYOUT}") from error
+        raise ModelError(f"there is no folder {name}, and the hub doesn't give it ({error}); {LAYOUT}") from error
     return folder
 
 

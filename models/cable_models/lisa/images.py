@@ -193,10 +193,8 @@ def check_frame(image: Image) -> None:
 def clip_resize(image: Image, geometry: ClipGeometry, border: Sequence[int]) -> Image:
     """What CLIP sees, in grey levels: uint8 [S, S, 3] BGR.
 
-    PIL resizes in two passes, first along the rows, then along the columns, and rounds to uint8 between them
-    (Pillow 13 turns the order round where it squashes a tall image). Making the two passes one by one gives the
-    same pixels in every version, and the rows of padding stay out of the first pass, the columns that are cut
-    away out of the second.
+    The frame is resized along its rows and its columns one after the other, so that the rows of padding stay out
+    of the first, costly pass and the columns that are cut away out of the second.
 
     Args:
         image: uint8 [H, W, 3] BGR.
@@ -224,11 +222,20 @@ def with_border(image: Image, corner: Size, size: Size, colour: Sequence[int]) -
 
 
 def pil_resize(image: Image, size: Size, resample: PilImage.Resampling) -> Image:
-    """PIL's resize with antialias; channel order doesn't matter to it."""
+    """PIL's resize with antialias: along the rows, rounded to uint8, then along the columns.
+
+    Up to version 12, Pillow does so by itself; from 13 on it turns the two passes round for some tall images, which
+    gives other grey levels.
+    """
     if image.shape[:2] == size:
         return image
-    height, width = size
-    return np.asarray(PilImage.fromarray(image).resize((width, height), resample))
+    height, width = image.shape[:2]
+    resized = PilImage.fromarray(image)
+    if width != size[1]:
+        resized = resized.resize((size[1], height), resample)
+    if height != size[0]:
+        resized = resized.resize((size[1], size[0]), resample)
+    return np.asarray(resized)
 
 
 def write_normalised(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from huggingface_hub.errors import StrictDataclassError
 from torch import nn
 from transformers import LlamaConfig
 from transformers.models.llama.modeling_llama import LlamaRotaryEmbedding
@@ -69,7 +70,8 @@ def load_lisa(
 ) -> LoadedLisa:
     """Load a LISA++ checkpoint in the layout its authors publish.
 
-    The peak of memory is the model and its largest tensor; nothing is initialised at random in between.
+    The peak of memory is the model and its largest tensor (250 MB more for .bin files); nothing is drawn at random in
+    between.
 
     Args:
         source: Folder, or hub id such as `Senqiao/LISA_Plus_7b`.
@@ -88,10 +90,13 @@ def load_lisa(
     checkpoint = open_checkpoint(source, revision)
     tower = find_clip(checkpoint, clip)
     sidecar = read_sam_sidecar(checkpoint.folder) if sam is None else sam
-    architecture = read_architecture(checkpoint.config, checkpoint.tensors.shapes, tower.config, sidecar)
+    try:
+        architecture = read_architecture(checkpoint.config, checkpoint.tensors.shapes, tower.config, sidecar)
+        model = build_empty(architecture)
+    except (KeyError, TypeError, ValueError, StrictDataclassError) as error:
+        raise ModelError(f"{checkpoint.folder}: no model can be built of these sizes: {error!r}") from error
     tokens = read_special_tokens(checkpoint.folder, checkpoint.config).within(architecture.llama.vocab_size)
     preprocessing = read_clip_preprocessing(tower.preprocessing, architecture.clip)
-    model = build_empty(architecture)
     weights = WeightSources(checkpoint, tower)
     parameters = [name for name, _ in model.named_parameters(remove_duplicate=False)]
     targets = names_by_original(parameters, sam_sizes_of(architecture.sam).iou_head_depth)

@@ -87,14 +87,16 @@ def decode_whole(
 def decode_part(sam: SamModel, frame: FrameFeatures, prompts: Tensor, side: int) -> Tensor:
     """Decodes one frame from its listed tokens, `decode_masks` says how."""
     pixels = PIXELS_PER_TOKEN * side
-    outside = prompts.new_full((len(prompts), side * side, PIXELS_PER_TOKEN, PIXELS_PER_TOKEN), OUTSIDE_LOGIT)
+    shape = (len(prompts), side * side, PIXELS_PER_TOKEN, PIXELS_PER_TOKEN)
+    dtype = sam.mask_decoder.iou_token.weight.dtype
+    outside = torch.full(shape, OUTSIDE_LOGIT, dtype=dtype, device=prompts.device)
     if frame.indexes is None or not outside.numel() or not len(frame.values):
         return outside.view(len(prompts), pixels, pixels)
     positions = dense_positional_embedding(sam).flatten(2)[:, :, frame.indexes, None]
     image = frame.values.T[None, :, :, None].expand(len(prompts), -1, -1, -1)
     strips = run_decoder(sam, image, positions, prompts)
     computed = strips.reshape(len(prompts), -1, PIXELS_PER_TOKEN, PIXELS_PER_TOKEN)
-    tokens = outside.to(computed.dtype).index_copy(1, frame.indexes, computed)
+    tokens = outside.index_copy(1, frame.indexes, computed)
     kept = torch.zeros(side * side, dtype=torch.bool, device=image.device).index_fill_(0, frame.indexes, True)
     low_res = tokens.view(len(prompts), side, side, PIXELS_PER_TOKEN, PIXELS_PER_TOKEN).transpose(2, 3)
     kept_pixels = kept.view(side, side).repeat_interleave(PIXELS_PER_TOKEN, 0).repeat_interleave(PIXELS_PER_TOKEN, 1)

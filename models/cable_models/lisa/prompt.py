@@ -23,7 +23,7 @@ SYSTEM_PROMPTS: Mapping[str, str] = {
     f"The assistant gives helpful, detailed, and polite answers to the {name}'s questions."
     for name in get_args(SystemPrompt)
 }
-""""human" is what the authors' chat scripts use, "user" what their training data sets used."""
+"""The authors' chat scripts use "human", their training data sets used "user"."""
 
 MODE_SUFFIXES: Mapping[str, str] = {
     "semantic": " Generate a mask for semantic segmentation. Focus on identifying the category as a whole; "

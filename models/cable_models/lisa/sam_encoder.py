@@ -65,7 +65,8 @@ def encode(vision_encoder: HfModule, pixels: Tensor, plans: Sequence[SamPlan | N
 
     Frames that are whole go through the unmodified module, in one batch. In the other frames, windows that are computed
     whole are exact up to the first global block; there and after, attention sees the computed tokens only. The
-    3 x 3 convolution of the neck sees, in place of a neighbour that wasn't computed, the token itself.
+    3 x 3 convolution of the neck sees, in place of a neighbour that wasn't computed, the token itself; tokens with all
+    eight neighbours computed are convolved exactly.
 
     Args:
         vision_encoder: ``SamModel.vision_encoder``.
@@ -196,8 +197,7 @@ def attend_in_windows(attention: HfModule, qkv: Tensor, packed: PackedTokens, wi
     query, key, value = filled.view(packed.windows, area, 3, heads, -1).permute(2, 0, 3, 1, 4).unbind(0)
     bias = window_bias(attention, query, window)
     if packed.hidden is not None:
-        masked = torch.zeros_like(packed.hidden, dtype=query.dtype).masked_fill_(packed.hidden, float("-inf"))
-        bias = masked if bias is None else bias + masked
+        bias = ~packed.hidden if bias is None else bias.masked_fill_(packed.hidden, float("-inf"))
     mixed = functional.scaled_dot_product_attention(query, key, value, attn_mask=bias)
     mixed = mixed.transpose(1, 2).reshape(packed.windows * area, -1)
     return mixed if filled is qkv else mixed[packed.slots]

@@ -131,7 +131,8 @@ def plan_sam(
         padding: "drop" leaves out, on frames with a region, the windows that hold no picture; "always" on every
             frame, a stated approximation; "keep" computes them.
         windows: "skip" leaves out windows that R_k doesn't touch, those of padding included. "tokens" computes the
-            tokens that R_k touches and no others: fewest operations, and an approximation from the first block on.
+            tokens that R_k touches and no others: fewest operations, and an approximation from the first block on;
+            where the sender filled the rest with a constant, what is left out held no picture.
         margin: Tokens by which R_k's tokens are grown, in the picture, before windows or tokens are chosen.
 
     Raises:

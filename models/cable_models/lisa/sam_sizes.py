@@ -194,13 +194,14 @@ def _decoder_sizes(sam: Shapes) -> dict[str, Any]:
     masks, hidden = _shape(sam, "mask_decoder.mask_tokens.weight", 2)
     transformer = "mask_decoder.transformer."
     internal = _shape(sam, f"{transformer}final_attn_token_to_image.q_proj.weight", 2)[0]
-    if not internal or hidden % internal:
-        raise ModelError(f"SAM: attention of {internal} channels is no whole fraction of a decoder width of {hidden}")
+    if hidden != 2 * internal:
+        # The blocks of transformers' mask decoder halve whatever their configuration says.
+        raise ModelError(f"SAM: cross attention of {internal} channels isn't half of a decoder width of {hidden}")
     return {
         "decoder_hidden_size": hidden,
         "decoder_num_layers": _count(sam, r"mask_decoder\.transformer\.layers\.(\d+)\."),
         "decoder_mlp_dim": _shape(sam, f"{transformer}layers.0.mlp.lin1.weight", 2)[0],
-        "attention_downsample_rate": hidden // internal,
+        "attention_downsample_rate": 2,
         "num_multimask_outputs": masks - 1,
         "iou_head_depth": _count(sam, r"mask_decoder\.iou_prediction_head\.layers\.(\d+)\.weight"),
         "iou_head_hidden_dim": _shape(sam, "mask_decoder.iou_prediction_head.layers.0.weight", 2)[0],

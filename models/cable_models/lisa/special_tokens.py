@@ -79,7 +79,7 @@ def read_special_tokens(folder: Path, config: Mapping[str, Any]) -> SpecialToken
     table = read_json(folder / "tokens.json")
     if table is not None:
         return _from_table(table, ends, folder / "tokens.json")
-    added = _added_tokens(folder)
+    added = read_added_tokens(folder)
     if "[SEG]" not in added:
         raise ModelError(
             f"{folder}: no [SEG] among the added tokens; a LISA checkpoint brings added_tokens.json or "
@@ -109,7 +109,12 @@ def _from_table(table: Mapping[str, Any], ends: Mapping[str, int], path: Path) -
     return SpecialTokens(**{**ends, **found})
 
 
-def _added_tokens(folder: Path) -> dict[str, int]:
+def read_added_tokens(folder: Path) -> dict[str, int]:
+    """Read the ids of a tokenizer's added tokens by their text; empty where the folder has no tokenizer files.
+
+    Raises:
+        ModelError: A file can't be read, or doesn't give texts and ids.
+    """
     whole, config, added = (
         read_json(folder / name) or {} for name in ("tokenizer.json", "tokenizer_config.json", "added_tokens.json")
     )

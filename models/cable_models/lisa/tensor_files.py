@@ -21,6 +21,9 @@ WEIGHT_FILES = (
 )
 """What a folder's weights may be called, the preferred first."""
 
+REMAP_BYTES = 250_000_000
+"""Bytes read of a .bin before its mapping is made anew."""
+
 
 @dataclass(frozen=True, slots=True)
 class TensorFiles:
@@ -35,7 +38,7 @@ class TensorFiles:
     def read(self, wanted: Collection[str]) -> Iterator[tuple[str, torch.Tensor]]:
         """Read tensors in the order of the files.
 
-        A tensor is mapped memory of its file: copy it, then let go of it, and no more than one is held at a time.
+        A tensor is mapped memory of its file: copy it and let go of it, so that little of a file is ever held.
 
         Args:
             wanted: Names to read; those the checkpoint lacks are passed over.
@@ -45,12 +48,8 @@ class TensorFiles:
         """
         for path, names in self.names.items():
             chosen = [name for name in names if name in wanted]
-            if path.suffix == ".safetensors":
-                yield from _read_safetensors(path, chosen)
-            elif chosen:
-                tensors = _load_bin(path)
-                for name in chosen:
-                    yield name, tensors.pop(name)
+            if chosen:
+                yield from (_read_safetensors if path.suffix == ".safetensors" else _read_bin)(path, chosen)
 
 
 def open_tensors(folder: Path) -> TensorFiles:
@@ -139,6 +138,18 @@ def _read_safetensors(path: Path, names: Collection[str]) -> Iterator[tuple[str,
         except (OSError, SafetensorError) as error:
             raise ModelError(f"{path}: {name} can't be read ({error}); fetch the file again") from error
         yield name, tensor
+
+
+def _read_bin(path: Path, names: Collection[str]) -> Iterator[tuple[str, torch.Tensor]]:
+    tensors: Mapping[str, torch.Tensor] = {}
+    resident = 0
+    for name in names:
+        # As above, but unpickling a file's whole table for each of its tensors would take longer than reading them.
+        if not tensors or resident > REMAP_BYTES:
+            tensors = _load_bin(path)
+            resident = 0
+        resident += tensors[name].nbytes
+        yield name, tensors[name]
 
 
 def _bin_headers(path: Path) -> _Header:

@@ -100,20 +100,17 @@ class LisaTokenizer:
         """Number of ids, from 0 to the highest added one; the embedding table has at least so many rows."""
         return max(self._pieces.get_piece_size(), *(token + 1 for token in self._whole.values()))
 
-    def has(self, text: str) -> bool:
-        """Whether a text is one token: an added one, a control token or a piece."""
-        return text in self._whole or self._pieces.piece_to_id(text) != self._pieces.unk_id()
-
     def token_id(self, text: str) -> int:
         """Id of an added token, a control token or a piece, looked up by its name and not by tokenising it.
 
         Raises:
             ModelError: the tokenizer has no such token.
         """
-        if not self.has(text):
+        token = self._whole.get(text, self._pieces.piece_to_id(text))
+        if token == self._pieces.unk_id() and text not in self._control:
             added = sorted(self._whole.keys() - self._control)
             raise ModelError(f"the tokenizer has no token {text!r}; its added tokens are {added}")
-        return self._whole.get(text, self._pieces.piece_to_id(text))
+        return token
 
     def encode(self, text: str, *, bos: bool | None = None) -> list[int]:
         """Token ids of a text.
@@ -182,14 +179,17 @@ class LisaTokenizer:
             if token in self._control.values() or token == IMAGE_PLACEHOLDER:
                 continue
             if token in self._names:
-                texts += [self._pieces.decode(plain), self._names[token]]
+                texts += [self._plain_text(plain), self._names[token]]
                 plain = []
             elif 0 <= token < self._pieces.get_piece_size():
                 plain.append(token)
             else:
                 raise ModelError(f"token id {token} is beyond the vocabulary of {self.vocabulary_size} tokens")
-        texts.append(self._pieces.decode(plain))
+        texts.append(self._plain_text(plain))
         return " ".join(filter(None, texts))
+
+    def _plain_text(self, ids: list[int]) -> str:
+        return self._pieces.decode(ids) if ids else ""
 
 
 def read_added_tokens(folder: Path) -> dict[str, int]:
