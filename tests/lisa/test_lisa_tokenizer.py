@@ -178,8 +178,7 @@ def test_refusals(tmp_path: Path, tokenizer: LisaTokenizer) -> None:
         without.token_id("[SEG]")
     with pytest.raises(ModelError, match="<im_start> is no token"):
         without.encode_prompt("USER: <im_start><image><im_end>\n")
-    with pytest.raises(ModelError, match="beyond the vocabulary of 383"):
-        tokenizer.decode([383])
+    assert tokenizer.decode([383]) == "<383>"
     for prompt, times in [("no image", 0), ("<image> <image>", 2)]:
         with pytest.raises(ModelError, match=f"{times} times"):
             tokenizer.encode_prompt(prompt)

@@ -15,7 +15,7 @@ from sentencepiece import SentencePieceProcessor
 
 from cable_models.errors import ModelError
 from cable_models.lisa.json_files import read_json
-from cable_models.lisa.special_tokens import IMAGE_PLACEHOLDER
+from cable_models.lisa.special_tokens import IMAGE_PLACEHOLDER, read_added_tokens
 
 IMAGE_TEXT = "<image>"
 """Stands for the picture in the text of a prompt; not a token."""
@@ -170,8 +170,7 @@ class LisaTokenizer:
     def decode(self, ids: Iterable[int]) -> str:
         """Text of token ids: added tokens by name with a space around them, without control tokens and the image.
 
-        Raises:
-            ModelError: an id is beyond the vocabulary.
+        Embedding tables may have more rows than the tokenizer has tokens; such an id is written as its number.
         """
         texts: list[str] = []
         plain: list[int] = []
@@ -184,25 +183,10 @@ class LisaTokenizer:
             elif 0 <= token < self._pieces.get_piece_size():
                 plain.append(token)
             else:
-                raise ModelError(f"token id {token} is beyond the vocabulary of {self.vocabulary_size} tokens")
+                texts += [self._plain_text(plain), f"<{token}>"]
+                plain = []
         texts.append(self._plain_text(plain))
         return " ".join(filter(None, texts))
 
     def _plain_text(self, ids: list[int]) -> str:
         return self._pieces.decode(ids) if ids else ""
-
-
-def read_added_tokens(folder: Path) -> dict[str, int]:
-    """Ids of the added tokens by their text, from `tokenizer_config.json` and `added_tokens.json`.
-
-    Raises:
-        ModelError: a file can't be read, or doesn't give texts and ids.
-    """
-    config = read_json(folder / "tokenizer_config.json") or {}
-    added = read_json(folder / "added_tokens.json") or {}
-    try:
-        decoder = config.get("added_tokens_decoder") or {}
-        known = {str(entry["content"]): int(token) for token, entry in decoder.items()}
-        return known | {text: int(token) for text, token in added.items()}
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ModelError(f"{folder}: the added tokens of its tokenizer files can't be read: {error!r}") from error
