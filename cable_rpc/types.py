@@ -219,6 +219,31 @@ class RoiMask:
 
 
 @dataclass(frozen=True, slots=True)
+class PrefillCost:
+    """A language model's prefill of one frame beside that of the same frame whole, in three columns.
+
+    The three belong together: the paper's quadratic estimate alone overstates what a model of billions of weights
+    saves (`cable_rpc.study.prefill`).
+    """
+
+    prompt_tokens: int
+    """n_p, tokens of the prompt besides the visual ones."""
+    speedup_quadratic: float
+    """The paper's estimate, ``((n_p + n_v) / n_in)^2``, by the tokens that really entered."""
+    speedup_flops: float
+    """Floating-point operations of the whole frame's prefill over those of this one's."""
+    measured_ns: int
+    """How long this prefill took."""
+    whole_ns: int = 0
+    """Prefill of a whole frame as measured on the same machine; 0 = none was seen yet."""
+
+    @property
+    def speedup_measured(self) -> float | None:
+        """``whole_ns / measured_ns``; None as long as either is unknown."""
+        return self.whole_ns / self.measured_ns if self.whole_ns > 0 and self.measured_ns > 0 else None
+
+
+@dataclass(frozen=True, slots=True)
 class Segmentation:
     """A segmenter's answer for one frame."""
 
@@ -232,6 +257,14 @@ class Segmentation:
     """Visual tokens that the full frame would have cost."""
     uncertainty: UncertaintyMap | None = None
     """[height, width]; None = not told."""
+    prefill: PrefillCost | None = None
+    """None where there is no language model, or it tells nothing of its prefill."""
+    stages_ns: Mapping[str, int] = field(default_factory=dict)
+    """Parts of the segmenter's time by name, e.g. ``clip``, ``prefill``, ``sam_encoder``; they need not add up."""
+    answer: str = ""
+    """What the language model answered in words."""
+    decoding: str = ""
+    """How the answer came about in the segmenter's words, e.g. ``forced`` or ``generate``."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from cable_rpc.cli.doctor import doctor
 from cable_rpc.cli.inspect import inspect
 from cable_rpc.cli.serve import serve
 from cable_rpc.cli.stream import stream
+from cable_rpc.cli.verify import verify_app
 from cable_rpc.errors import CableError
 
 app = typer.Typer(
@@ -33,6 +34,7 @@ app.command()(demo)
 app.command()(inspect)
 app.command()(codec_study)
 app.command()(doctor)
+app.add_typer(verify_app, name="verify")
 
 
 def _version(wanted: bool) -> None:

@@ -17,11 +17,18 @@ def serve(
     ] = "127.0.0.1:50051",
     detector: Annotated[
         str,
-        typer.Option(help="embedded | onnx:FILE (RT-DETR export with labels/boxes/scores or logits/pred_boxes)."),
+        typer.Option(
+            help="embedded (compact, rendered world) | rtdetr:FOLDER_OR_HUB_ID (e.g. PekingU/rtdetr_r50vd) | onnx:FILE "
+            "(RT-DETR export with labels/boxes/scores or logits/pred_boxes)."
+        ),
     ] = "embedded",
     segmenter: Annotated[
         str,
-        typer.Option(help="boxes (the detector's boxes, filled) | oracle:SOURCE (ground truth, evaluation only)."),
+        typer.Option(
+            help="boxes (the detector's boxes, filled) | lisa:FOLDER_OR_HUB_ID (LISA++, e.g. Senqiao/LISA_Plus_7b; "
+            "options follow as ?key=value&key=value, in quotes, and lisa alone lists them) | crop:SEGMENTER (any "
+            "other one, shown only the box around the region) | oracle:SOURCE (ground truth, evaluation only)."
+        ),
     ] = "boxes",
     device: Annotated[str, typer.Option(help="auto | cpu | cuda.")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads of each model.", min=1)] = 1,
@@ -37,7 +44,11 @@ def serve(
 ) -> None:
     """Host the models and answer cameras over gRPC.
 
-    Example: [bold]cable-rpc serve --listen 0.0.0.0:50051 --insecure --detector onnx:rtdetr_r50vd.onnx[/bold]
+    Example: [bold]cable-rpc serve --device cuda --segmenter lisa:Senqiao/LISA_Plus_7b
+    --detector rtdetr:PekingU/rtdetr_r50vd[/bold]
+
+    From other machines: add [bold]--listen 0.0.0.0:50051 --insecure[/bold]. Without pruning of tokens:
+    [bold]--segmenter 'lisa:FOLDER?image_tokens=all&sam_windows=all'[/bold]
     """
     if not (insecure or is_loopback(listen)):
         raise ConfigurationError(
@@ -55,8 +66,9 @@ def serve(
     from cable_rpc.cloud.session import SessionLimits
 
     options = BackendOptions(device=device, threads=threads, min_score=min_score)
-    hosted_segmenter = load_segmenter(segmenter, options)
+    # The detector first: it is loaded in a moment, and what is wrong with it should not wait for a large segmenter.
     hosted_detector = load_detector(detector, options)
+    hosted_segmenter = load_segmenter(segmenter, options)
     models = PerceptionModels(
         hosted_detector, hosted_segmenter, ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
     )

@@ -2,7 +2,8 @@
 
 A back end registers through an entry point of the group ``cable_rpc.detectors`` or ``cable_rpc.segmenters``: a
 callable ``(argument: str, options: BackendOptions) -> Detector | Segmenter``. ``--segmenter lisa:FOLDER`` calls the
-entry point ``lisa`` with ``"FOLDER"``.
+entry point ``lisa`` with ``"FOLDER"``; a back end that wraps another one has its options before the colon, and
+``--segmenter crop?margin=32:lisa:FOLDER`` calls ``crop`` with ``"?margin=32:lisa:FOLDER"``.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ class FrameContext:
     """The camera's frame number."""
     detections: Detections
     """The detector's boxes of the same picture."""
+    stream: str = ""
+    """Which camera's session it belongs to, for what a back end keeps from frame to frame; "" = none in particular."""
 
 
 class Detector(Protocol):
@@ -51,7 +54,11 @@ class Detector(Protocol):
 
 
 class Segmenter(Protocol):
-    """Answers with a mask of road actors."""
+    """Answers with a mask of road actors.
+
+    One that keeps anything by ``FrameContext.stream`` may also have ``forget_stream(stream: str) -> None``: it is
+    called when a session has ended, where ``segment`` runs and after its last frame, also for unknown streams.
+    """
 
     name: str
     revision: str
@@ -66,7 +73,10 @@ class Segmenter(Protocol):
 
 
 def _load(kind: str, spec: str, options: BackendOptions) -> Any:
-    name, _, argument = spec.partition(":")
+    head, colon, argument = spec.partition(":")
+    name, mark, query = head.partition("?")
+    if mark:
+        argument = f"?{query}{colon}{argument}"
     known = {entry.name: entry for entry in entry_points(group=f"cable_rpc.{kind}s")}
     if name not in known:
         raise ConfigurationError(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +14,8 @@ from cable_rpc.cloud.backends import Detector, FrameContext, Segmenter
 from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
 from cable_rpc.errors import ModelError
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
+
+log = logging.getLogger(__name__)
 
 DEFAULT_PROMPT = "Please segment all vehicles, pedestrians and cyclists on the road."
 
@@ -28,6 +33,12 @@ class StageRun:
     def of(cls, stage: str, run: ModelRun[Any]) -> StageRun:
         """Names a model run."""
         return cls(stage, run.wait_ns, run.run_ns, run.batch_size)
+
+    @classmethod
+    def parts(cls, stage: str, run: ModelRun[Segmentation]) -> tuple[StageRun, ...]:
+        """The parts of its time that a segmenter tells, named ``STAGE.PART``."""
+        stages = run.value.stages_ns
+        return tuple(cls(f"{stage}.{part}", 0, took_ns, run.batch_size) for part, took_ns in stages.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +64,10 @@ class PerceptionModels:
         self.segmenter = segmenter
         self._detector_runner = detector_runner
         self._segmenter_runner = segmenter_runner
+        self._farewells: set[asyncio.Task[None]] = set()
 
     async def perceive(
-        self, image: Image, roi: BoolMask | None, *, prompt: str, min_score: float, sequence: int
+        self, image: Image, roi: BoolMask | None, *, prompt: str, min_score: float, sequence: int, stream: str = ""
     ) -> Perception:
         """Runs both models on one picture.
 
@@ -65,15 +77,37 @@ class PerceptionModels:
             prompt: sentence for the segmenter; empty = `DEFAULT_PROMPT`.
             min_score: detections below are dropped.
             sequence: the camera's frame number.
+            stream: the camera's session.
         """
         detected = await self._detector_runner.infer(lambda: self.detector.detect([image])[0])
         detections = detected.value.select(detected.value.scores >= min_score)
-        context = FrameContext(sequence, detections)
+        context = FrameContext(sequence, detections, stream)
         segmented = await self._segmenter_runner.infer(
             lambda: _inside(self.segmenter, image, roi, prompt or DEFAULT_PROMPT, context)
         )
-        stages = (StageRun.of("detect", detected), StageRun.of("segment", segmented))
+        stages = (
+            StageRun.of("detect", detected),
+            StageRun.of("segment", segmented),
+            *StageRun.parts("segment", segmented),
+        )
         return Perception(detections, segmented.value, stages)
+
+    def forget_stream(self, stream: str) -> None:
+        """Lets the segmenter drop what it keeps of an ended session, once it has answered that session's frames.
+
+        Returns at once: a session must not end late because the model is busy with another one's frame.
+        """
+        forget = getattr(self.segmenter, "forget_stream", None)
+        if forget is not None:
+            farewell = asyncio.create_task(self._forget(forget, stream))
+            self._farewells.add(farewell)
+            farewell.add_done_callback(self._farewells.discard)
+
+    async def _forget(self, forget: Callable[[str], None], stream: str) -> None:
+        try:
+            await self._segmenter_runner.infer(lambda: forget(stream))
+        except Exception:
+            log.exception("segmenter %s did not forget session %s", self.segmenter.name, stream)
 
 
 def _inside(

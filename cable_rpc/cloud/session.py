@@ -101,6 +101,7 @@ class PerceptionSession:
                 if task is not None:
                     task.cancel()
             await asyncio.gather(reader, inference, return_exceptions=True)
+            self._models.forget_stream(self.session_id)
             if self._decoder is not None:
                 # Cancelling the reader does not stop a decode under way: closing waits for it, off the loop.
                 await asyncio.to_thread(self._decoder.close)
@@ -330,6 +331,7 @@ class PerceptionSession:
                 prompt=self._task.prompt,
                 min_score=self._task.min_score or self._limits.default_min_score,
                 sequence=frame.sequence,
+                stream=self.session_id,
             )
         except asyncio.CancelledError:
             raise

@@ -13,6 +13,7 @@ from cable_codecs import CodecError, CodecParameters, RegionTreatment, TreatedDe
 
 from cable_rpc.edge.streamer import StreamedFrame
 from cable_rpc.study.annotate import AnnotatedVideoWriter, annotate, status_line
+from cable_rpc.study.language_record import language_columns, segment_parts, whole_prefill
 from cable_rpc.study.metrics import match_detections, recognition_curve, retained, visible_truth
 from cable_rpc.study.run_record import STILLS_FOLDER, VIDEO_FILE, FrameRecord
 from cable_rpc.types import BoolMask, Detections, Frame, Image, RoiMask
@@ -101,6 +102,7 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
         decode_ns=times.decode_ns,
         detect_ns=times.run_ns.get("detect"),
         segment_ns=times.run_ns.get("segment"),
+        **segment_parts(times.parts_of("segment")),
         server_ns=times.send_time_ns - times.receive_time_ns,
         downlink_ns=downlink_ns,
         apply_ns=streamed.apply_ns,
@@ -108,6 +110,7 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
         detection_count=len(answer.detections),
         mask_coverage=float(segmentation.mask.mean()) if segmentation else None,
         mask_confidence=segmentation.confidence if segmentation else None,
+        **language_columns(segmentation),
     )
     return FrameEvidence(record, prepared.sent_region, answer.detections, answer.mask_data)
 
@@ -161,6 +164,7 @@ class RunEvaluator:
             roi_psnr_db=psnr if psnr is not None and np.isfinite(psnr) else None,
             baseline_bitstream_bytes=len(whole.prepared.encoded.data),
             baseline_message_bytes=whole.prepared.uplink_message_bytes,
+            **whole_prefill(whole.answer.segmentation),
         )
         judged = replace(evidence, record=record)
         self._draw(frame, judged, received)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.language_table import PREFILL_COLUMNS, language_rows, prefill_rows, speedup_texts
 from cable_rpc.study.run_record import (
     FRAMES_FILE,
     REPORT_FILE,
@@ -70,6 +71,9 @@ def write_report(run_dir: Path) -> Path:
         tiles=tiles_of(summary),
         layers=layer_rows(summary),
         quality=quality_rows(summary),
+        language=[] if summary.language is None else language_rows(summary.language),
+        prefill_columns=PREFILL_COLUMNS,
+        prefill=prefill_rows(summary),
         notes=honesty_notes(summary),
         environment=environment_rows(info),
         plots=[
@@ -112,6 +116,11 @@ def tiles_of(summary: RunSummary) -> list[Tile]:
         shares = dict(quality.recognition)
         detail = f"of the objects with half their box sent; {percent(shares.get(0.05))} at 5 %"
         tiles.append(Tile("recognised", percent(shares.get(0.5)), detail))
+    if summary.language is not None and summary.language.of_run is not None:
+        texts = [text.removesuffix(" ×") for text in speedup_texts(summary.language.of_run)]
+        tiles.append(
+            Tile("prefill, times faster", " / ".join(texts), "the paper's estimate / by operations / as measured")
+        )
     return tiles
 
 

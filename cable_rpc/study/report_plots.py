@@ -42,7 +42,14 @@ class Plot:
 def plots_of(records: Sequence[FrameRecord], fps: float) -> list[Plot]:
     """All plots that the records have the data for."""
     sent = [record for record in records if record.outcome in ("answered", "rejected")]
-    candidates = (bytes_plot(sent), coverage_plot(sent), latency_plot(sent), stage_plot(sent), quality_plot(sent))
+    candidates = (
+        bytes_plot(sent),
+        coverage_plot(sent),
+        latency_plot(sent),
+        stage_plot(sent),
+        quality_plot(sent),
+        prefill_plot(sent),
+    )
     return [plot for plot in candidates if plot is not None]
 
 
@@ -161,6 +168,25 @@ def quality_plot(sent: Sequence[FrameRecord]) -> Plot | None:
     figure.update_yaxes(range=[0, 103])
     figure.update_layout(showlegend=True)
     return Plot("quality", "Quality", f"Pooled over the {WINDOW} frames up to each one.", figure)
+
+
+def prefill_plot(sent: Sequence[FrameRecord]) -> Plot | None:
+    """Speed-up of each frame's prefill: estimated, by operations, by the clock; where a language model tells it."""
+    told = [record for record in sent if record.prefill_quadratic is not None]
+    if not told:
+        return None
+    measured = [r.prefill_whole_ns / r.prefill_ns if r.prefill_whole_ns and r.prefill_ns else None for r in told]
+    lines = (
+        ("paper's estimate", ORANGE, [record.prefill_quadratic for record in told]),
+        ("operations", BLUE, [record.prefill_flops for record in told]),
+        ("measured", GREEN, measured),
+    )
+    figure = new_figure("frame", "times faster")
+    for name, colour, values in lines:
+        x = [record.index for record in told]
+        figure.add_scatter(x=x, y=values, name=name, mode="lines", line={"color": colour, "width": 1.6})
+    caption = "Prefill of the whole frame over this frame's. The estimate takes all work for attention."
+    return Plot("prefill", "Prefill", caption, figure)
 
 
 WINDOW = 10

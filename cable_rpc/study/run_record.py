@@ -66,6 +66,14 @@ class FrameRecord:
     decode_ns: int | None = None
     detect_ns: int | None = None
     segment_ns: int | None = None
+    segment_preprocess_ns: int | None = None
+    """This and the next six are parts of ``segment_ns``, as the segmenter tells them."""
+    segment_clip_ns: int | None = None
+    segment_prefill_ns: int | None = None
+    segment_decode_ns: int | None = None
+    segment_sam_encoder_ns: int | None = None
+    segment_mask_decoder_ns: int | None = None
+    segment_postprocess_ns: int | None = None
     server_ns: int | None = None
     """Receive to send on the server: the queue and all work, and whatever lies between."""
     downlink_ns: int | None = None
@@ -76,6 +84,24 @@ class FrameRecord:
     detection_count: int | None = None
     mask_coverage: float | None = None
     mask_confidence: float | None = None
+
+    tokens_in: int | None = None
+    """Visual tokens that entered the language model; None where the segmenter has none."""
+    tokens_full: int | None = None
+    """Visual tokens of the whole frame."""
+    prompt_tokens: int | None = None
+    """Tokens of the prompt besides them; None, like the next four, where the segmenter tells nothing of its prefill."""
+    prefill_quadratic: float | None = None
+    """Speed-up of the prefill by the paper's estimate; never to be shown without the other columns."""
+    prefill_flops: float | None = None
+    """Speed-up of the prefill by its operations."""
+    prefill_ns: int | None = None
+    """The prefill as measured."""
+    prefill_whole_ns: int | None = None
+    """The prefill of the same frame sent whole, as measured in the full-frame pass; without one, of whole frames that
+    the server had seen; None = not yet."""
+    decoding: str = ""
+    """How the language model's answer came about; empty without one."""
 
     truth_count: int | None = None
     recognised: int | None = None

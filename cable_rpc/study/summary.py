@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from cable_rpc.study.language_summary import LanguageCost, language_cost
 from cable_rpc.study.metrics import (
     MatchCounts,
     Scores,
@@ -30,12 +31,19 @@ STAGES = {
     "decode": "decode",
     "detect": "detect",
     "segment": "segment",
+    "segment_preprocess": "· image preparation",
+    "segment_clip": "· CLIP",
+    "segment_prefill": "· prefill",
+    "segment_decode": "· token by token",
+    "segment_sam_encoder": "· SAM encoder",
+    "segment_mask_decoder": "· mask decoder",
+    "segment_postprocess": "· enlarging masks",
     "server": "server in all",
     "downlink": "downlink",
     "apply": "apply mask",
     "end_to_end": "end to end",
 }
-"""Stages in the order of a frame's way; each is the field ``<stage>_ns`` of a record."""
+"""Stages in the order of a frame's way, parts of a stage after it; each is the field ``<stage>_ns`` of a record."""
 
 RECOGNITION_FIELDS = {
     0.05: "recognised",
@@ -128,6 +136,8 @@ class RunSummary:
     staleness_mean_frames: float | None
     staleness_max_frames: int | None
     quality: Quality
+    language: LanguageCost | None = None
+    """None where the segmenter has no language model."""
 
     def layer(self, name: str) -> LayerBytes:
         """The layer of that name."""
@@ -159,6 +169,7 @@ def summarise(records: Sequence[FrameRecord], info: RunInfo) -> RunSummary:
         staleness_mean_frames=mean_or_none(staleness),
         staleness_max_frames=max(staleness, default=None),
         quality=quality_of(records),
+        language=language_cost([record for record in records if record.outcome == "answered"]),
     )
 
 
@@ -321,6 +332,12 @@ def honesty_notes(summary: RunSummary) -> tuple[str, ...]:
         notes.append(
             "The segmenter is the oracle: it reads the ground truth, so the figures are an upper bound of "
             "what a real model reaches."
+        )
+    if summary.language is not None and summary.language.of_run is not None:
+        notes.append(
+            "Prefill: the paper's column takes all work for attention, which is a few percent of a language model's "
+            "work at these lengths; the operations and the clock say what is gained. The prefill is one part of the "
+            "segmenter's time."
         )
     if summary.quality.truth_frames == 0:
         notes.append("The source has no truth: recognition, precision and recall can't be stated.")

@@ -7,8 +7,9 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from cable_rpc.study.language_table import PREFILL_COLUMNS, language_rows, prefill_rows
 from cable_rpc.study.metrics import Scores
-from cable_rpc.study.summary import LayerBytes, Quality, RunSummary, honesty_notes
+from cable_rpc.study.summary import LayerBytes, Quality, RunSummary, StageLatency, honesty_notes
 
 LAYER_LABELS = {
     "bitstream": "coded picture · mask",
@@ -21,13 +22,14 @@ TABLE_WIDTH = 98
 
 
 def render_summary(summary: RunSummary) -> RenderableType:
-    """Three compact tables (bytes, latency, quality) and the notes, for a terminal of 100 columns."""
+    """Compact tables (bytes, latency, quality, language model) and the notes, for a terminal of 100 columns."""
     return Group(
         headline(summary),
         Text(),
         bytes_table(summary),
         latency_table(summary),
         quality_table(summary),
+        *language_tables(summary),
         *(Text(f"· {note}", style="dim") for note in honesty_notes(summary)),
     )
 
@@ -106,9 +108,14 @@ def latency_table(summary: RunSummary) -> Table:
             *(f"{value:.1f}" for value in (stage.mean_ms, stage.p50_ms, stage.p95_ms, stage.p99_ms)),
             str(stage.frames),
             Text("━" * length, style="cyan" if bold else "blue"),
-            style="bold" if bold else ("dim" if stage.stage in ("capture", "server") else ""),
+            style="bold" if bold else ("dim" if stage.stage in ("capture", "server") or is_part(stage) else ""),
         )
     return table
+
+
+def is_part(stage: StageLatency) -> bool:
+    """Whether its time is contained in that of another stage."""
+    return stage.label.startswith("·")
 
 
 def quality_table(summary: RunSummary) -> Table:
@@ -120,6 +127,28 @@ def quality_table(summary: RunSummary) -> Table:
     for name, value, remark in quality_rows(summary):
         table.add_row(name, value, Text(remark, style="dim"))
     return table
+
+
+def language_tables(summary: RunSummary) -> list[Table]:
+    """Tokens, and the prefill's three columns; nothing for a segmenter without a language model."""
+    if summary.language is None:
+        return []
+    tokens = new_table("Language model")
+    tokens.add_column("figure", no_wrap=True)
+    tokens.add_column("value", justify="right", no_wrap=True)
+    tokens.add_column("of what")
+    for name, value, remark in language_rows(summary.language):
+        tokens.add_row(name, value, Text(remark, style="dim"))
+    rows = prefill_rows(summary)
+    if not rows:
+        return [tokens]
+    prefill = new_table("Prefill speed-up")
+    for name in PREFILL_COLUMNS[:-1]:
+        prefill.add_column(name, justify="left" if name == PREFILL_COLUMNS[0] else "right", no_wrap=True)
+    prefill.add_column(PREFILL_COLUMNS[-1])
+    for *cells, remark in rows:
+        prefill.add_row(*cells, Text(remark, style="dim"))
+    return [tokens, prefill]
 
 
 def quality_rows(summary: RunSummary) -> list[tuple[str, str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from cable_rpc.types import Detections, Segmentation
 from cable_rpc.wire.convert import detections_from_messages, mask_from_message
@@ -20,7 +20,7 @@ class ServerTimes:
     queue_ns: int = 0
     """All waiting for threads and models."""
     run_ns: Mapping[str, int] = field(default_factory=dict)
-    """Model stages ("detect", "segment") to their durations."""
+    """Model stages ("detect", "segment") to their durations, and the parts of a stage ("segment.clip")."""
 
     @classmethod
     def from_message(cls, timing: pb.ServerTiming) -> ServerTimes:
@@ -32,6 +32,11 @@ class ServerTimes:
             timing.decode_wait_ns + sum(stage.wait_ns for stage in timing.stages),
             {stage.stage: stage.run_ns for stage in timing.stages},
         )
+
+    def parts_of(self, stage: str) -> dict[str, int]:
+        """The named parts of a model's stage to their durations; empty where it tells none."""
+        prefix = f"{stage}."
+        return {name.removeprefix(prefix): took for name, took in self.run_ns.items() if name.startswith(prefix)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +68,17 @@ class FrameAnswer:
             ProtocolError: if the mask does not belong to a frame of this size, or is damaged.
         """
         has_mask = result.HasField("mask")
+        times = ServerTimes.from_message(result.timing)
+        segmentation = None
+        if has_mask:
+            segmentation = replace(mask_from_message(result.mask, height, width), stages_ns=times.parts_of("segment"))
         return cls(
             result.sequence,
             receive_time_ns,
             message_bytes,
-            ServerTimes.from_message(result.timing),
+            times,
             detections_from_messages(result.detections),
-            mask_from_message(result.mask, height, width) if has_mask else None,
+            segmentation,
             result.mask.data if has_mask else b"",
             result.mask.uncertainty if has_mask else b"",
         )

@@ -9,7 +9,7 @@ from cable_codecs import CodecError, decode_mask, encode_mask
 from google.rpc import code_pb2, status_pb2
 
 from cable_rpc.errors import CableError, ProtocolError
-from cable_rpc.types import CameraIntrinsics, Detections, EgoMotion, RoiMask, Segmentation
+from cable_rpc.types import CameraIntrinsics, Detections, EgoMotion, PrefillCost, RoiMask, Segmentation
 from cable_rpc.wire.uncertainty import decode_uncertainty, encode_uncertainty
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
@@ -102,9 +102,9 @@ def detections_from_messages(messages: Iterable[pb.Detection]) -> Detections:
 
 
 def mask_to_message(segmentation: Segmentation) -> pb.Mask:
-    """Codes a segmenter's mask and uncertainty for the downlink."""
+    """Codes a segmenter's answer for the downlink; its stages travel in ServerTiming instead."""
     height, width = segmentation.mask.shape
-    uncertainty = segmentation.uncertainty
+    uncertainty, prefill = segmentation.uncertainty, segmentation.prefill
     return pb.Mask(
         width=width,
         height=height,
@@ -113,11 +113,14 @@ def mask_to_message(segmentation: Segmentation) -> pb.Mask:
         tokens_in=segmentation.tokens_in,
         tokens_full=segmentation.tokens_full,
         uncertainty=b"" if uncertainty is None else encode_uncertainty(uncertainty),
+        prefill=None if prefill is None else prefill_to_message(prefill),
+        answer=segmentation.answer,
+        decoding=segmentation.decoding,
     )
 
 
 def mask_from_message(message: pb.Mask, height: int, width: int) -> Segmentation:
-    """Decodes a mask that must have the frame's size; its uncertainty is None where the server tells none.
+    """Decodes a mask that must have the frame's size; what the server does not tell is None or empty.
 
     Raises:
         ProtocolError: if the size differs, or the bitmap or the uncertainty is damaged.
@@ -129,7 +132,38 @@ def mask_from_message(message: pb.Mask, height: int, width: int) -> Segmentation
     except CodecError as error:
         raise ProtocolError(f"Mask.data is damaged: {error}") from error
     uncertainty = decode_uncertainty(message.uncertainty, height, width) if message.uncertainty else None
-    return Segmentation(mask, message.confidence, message.tokens_in, message.tokens_full, uncertainty)
+    return Segmentation(
+        mask,
+        message.confidence,
+        message.tokens_in,
+        message.tokens_full,
+        uncertainty,
+        prefill_from_message(message.prefill) if message.HasField("prefill") else None,
+        answer=message.answer,
+        decoding=message.decoding,
+    )
+
+
+def prefill_to_message(prefill: PrefillCost) -> pb.PrefillCost:
+    """The cost of a language model's prefill for the downlink."""
+    return pb.PrefillCost(
+        prompt_tokens=prefill.prompt_tokens,
+        speedup_quadratic=prefill.speedup_quadratic,
+        speedup_flops=prefill.speedup_flops,
+        measured_ns=prefill.measured_ns,
+        whole_ns=prefill.whole_ns,
+    )
+
+
+def prefill_from_message(message: pb.PrefillCost) -> PrefillCost:
+    """The inverse of `prefill_to_message`."""
+    return PrefillCost(
+        message.prompt_tokens,
+        message.speedup_quadratic,
+        message.speedup_flops,
+        message.measured_ns,
+        message.whole_ns,
+    )
 
 
 def ego_to_message(ego: EgoMotion) -> pb.EgoMotion:

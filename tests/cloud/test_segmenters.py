@@ -76,7 +76,8 @@ def test_oracle_of_a_plain_video_is_refused(shared_clip: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spec", "said"), [("lisa:folder", "installed: boxes, oracle"), ("boxes:7", "no argument"), ("oracle", "oracle:")]
+    ("spec", "said"),
+    [("lips:folder", "installed: boxes, crop,"), ("boxes:7", "no argument"), ("oracle", "oracle:")],
 )
 def test_unusable_names_are_explained(spec: str, said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):

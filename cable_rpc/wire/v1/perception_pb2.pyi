@@ -365,7 +365,7 @@ class Detection(_message.Message):
     def __init__(self, x_min: _Optional[float] = ..., y_min: _Optional[float] = ..., x_max: _Optional[float] = ..., y_max: _Optional[float] = ..., class_id: _Optional[int] = ..., score: _Optional[float] = ...) -> None: ...
 
 class Mask(_message.Message):
-    __slots__ = ("width", "height", "data", "confidence", "tokens_in", "tokens_full", "uncertainty")
+    __slots__ = ("width", "height", "data", "confidence", "tokens_in", "tokens_full", "uncertainty", "prefill", "answer", "decoding")
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
@@ -373,6 +373,9 @@ class Mask(_message.Message):
     TOKENS_IN_FIELD_NUMBER: _ClassVar[int]
     TOKENS_FULL_FIELD_NUMBER: _ClassVar[int]
     UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
+    PREFILL_FIELD_NUMBER: _ClassVar[int]
+    ANSWER_FIELD_NUMBER: _ClassVar[int]
+    DECODING_FIELD_NUMBER: _ClassVar[int]
     width: int
     height: int
     data: bytes
@@ -380,7 +383,24 @@ class Mask(_message.Message):
     tokens_in: int
     tokens_full: int
     uncertainty: bytes
-    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., data: _Optional[bytes] = ..., confidence: _Optional[float] = ..., tokens_in: _Optional[int] = ..., tokens_full: _Optional[int] = ..., uncertainty: _Optional[bytes] = ...) -> None: ...
+    prefill: PrefillCost
+    answer: str
+    decoding: str
+    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., data: _Optional[bytes] = ..., confidence: _Optional[float] = ..., tokens_in: _Optional[int] = ..., tokens_full: _Optional[int] = ..., uncertainty: _Optional[bytes] = ..., prefill: _Optional[_Union[PrefillCost, _Mapping]] = ..., answer: _Optional[str] = ..., decoding: _Optional[str] = ...) -> None: ...
+
+class PrefillCost(_message.Message):
+    __slots__ = ("prompt_tokens", "speedup_quadratic", "speedup_flops", "measured_ns", "whole_ns")
+    PROMPT_TOKENS_FIELD_NUMBER: _ClassVar[int]
+    SPEEDUP_QUADRATIC_FIELD_NUMBER: _ClassVar[int]
+    SPEEDUP_FLOPS_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_NS_FIELD_NUMBER: _ClassVar[int]
+    WHOLE_NS_FIELD_NUMBER: _ClassVar[int]
+    prompt_tokens: int
+    speedup_quadratic: float
+    speedup_flops: float
+    measured_ns: int
+    whole_ns: int
+    def __init__(self, prompt_tokens: _Optional[int] = ..., speedup_quadratic: _Optional[float] = ..., speedup_flops: _Optional[float] = ..., measured_ns: _Optional[int] = ..., whole_ns: _Optional[int] = ...) -> None: ...
 
 class FrameRejected(_message.Message):
     __slots__ = ("sequence", "reason", "message", "timing")
