@@ -53,10 +53,8 @@ def run_layers(model: LisaModel, hidden: torch.Tensor, mask: torch.Tensor | None
     """The transformer blocks up to the selected hidden state; those above it are not needed."""
     layers = clip_transformer(model.vision_tower).encoder.layers
     selected = model.architecture.select_layer
-    for layer in layers[: selected if selected >= 0 else len(layers) + 1 + selected]:
-        output = layer(hidden, mask)
-        hidden = output[0] if isinstance(output, tuple) else output
-    return hidden
+    used = layers[: selected if selected >= 0 else len(layers) + 1 + selected]
+    return model.stacks.clip(list(used), hidden, mask)
 
 
 def key_mask(lengths: Sequence[int], padded: torch.Tensor) -> torch.Tensor | None:

@@ -10,6 +10,7 @@ from torch.nn.utils.rnn import pad_sequence
 from transformers import Cache
 
 from cable_models.errors import ModelError
+from cable_models.lisa.compiled import decoder_stack
 from cable_models.lisa.model import LisaModel
 
 
@@ -110,24 +111,13 @@ def forward(
 
     Args:
         model: The network.
-        embeddings: [B, n, width].
+        embeddings: [B, n, width]; n is 1 where the cache holds anything.
         positions: int64 [B, n], rotary positions, gaps allowed.
         cache: Keys and values of the tokens before; grows by these.
     """
-    seen = 0 if cache is None else cache.get_seq_length()
-    # transformers takes a gap in the positions for the border of a packed sequence unless a mask is given
-    everything = torch.ones(
-        (embeddings.shape[0], seen + embeddings.shape[1]), dtype=torch.bool, device=embeddings.device
-    )
-    output = model.language_model(
-        inputs_embeds=embeddings,
-        attention_mask=everything,
-        position_ids=positions,
-        past_key_values=cache,
-        use_cache=cache is not None,
-    )
-    hidden: torch.Tensor = output.last_hidden_state
-    return hidden
+    if cache is None:
+        return model.stacks.language(model.language_model, embeddings, positions)
+    return decoder_stack(model.language_model, embeddings, positions, cache)
 
 
 def source_indices(ids: Sequence[int], prompt: SplicedPrompt, seg: int) -> list[int]:

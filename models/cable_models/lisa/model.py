@@ -11,6 +11,7 @@ from transformers import CLIPVisionModel, LlamaModel, SamModel
 
 from cable_models.errors import ModelError
 from cable_models.lisa.architecture import LisaArchitecture, projector_depth
+from cable_models.lisa.compiled import Stacks
 
 
 class LisaModel(nn.Module):
@@ -34,6 +35,7 @@ class LisaModel(nn.Module):
         self.lm_head = nn.Linear(width, architecture.llama.vocab_size, bias=False)
         self.text_hidden_fcs = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, architecture.out_dim))
         self.sam = SamModel(architecture.sam)
+        self.stacks = Stacks()
 
     @property
     def device(self) -> torch.device:

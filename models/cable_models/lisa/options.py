@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from cable_models.errors import ModelError
+from cable_models.lisa.compiled import CompileMode
 from cable_models.lisa.images import ClipFit
 from cable_models.lisa.prompt import PromptMode, SystemPrompt
 from cable_models.lisa.sam_plan import SamPadding, SamWindows
@@ -75,6 +76,12 @@ class LisaOptions:
         },
     )
     sam_margin: int = field(default=1, metadata={"help": "SAM tokens by which the region is grown before"})
+    compile: CompileMode = field(
+        default="none",
+        metadata={
+            "help": "none; default: torch.compile of the blocks; reduce-overhead: of the whole stacks, with CUDA graphs"
+        },
+    )
     token_bucket: int = field(
         default=0, metadata={"help": "prompts are padded to a multiple of this, for compiled graphs; 0 = not"}
     )

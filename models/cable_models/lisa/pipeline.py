@@ -13,6 +13,7 @@ import torch
 
 from cable_models.detection import Float32Array, Image
 from cable_models.lisa.clip_tower import patch_features, project
+from cable_models.lisa.compiled import compile_model
 from cable_models.lisa.decoding import Answer
 from cable_models.lisa.frame_input import BoolMask, FrameInput, prepare_frame
 from cable_models.lisa.language import ImageTokens, segmentation_embeddings
@@ -72,6 +73,8 @@ class LisaPipeline:
     def __init__(self, loaded: LoadedLisa, options: LisaOptions | None = None) -> None:
         self.loaded = loaded
         self.options = options or LisaOptions()
+        if self.options.compile != "none":
+            compile_model(loaded.model, self.options.compile)
         answer = first_forced_answer(loaded, self.options)
         self._patch_size = loaded.clip_preprocessing.size // loaded.architecture.patch_grid
         self._grid = grid_of(loaded.model.sam.vision_encoder)
@@ -103,17 +106,24 @@ class LisaPipeline:
                     self._patch_size,
                     self._grid,
                     self.options,
+                    model.device,
                 )
                 for request in requests
             ]
-            clip_pixels = self._on_device([frame.clip_pixels for frame in frames])
-            sam_pixels = self._on_device([frame.sam_pixels for frame in frames])
+            clip_pixels = torch.stack([frame.clip_pixels for frame in frames])
+            sam_pixels = torch.stack([frame.sam_pixels for frame in frames])
         with timer.stage("clip"):
             images = self._image_tokens(clip_pixels, frames)
         answers = self._answers.answer([request.stream for request in requests], prompts, images, timer)
         with timer.stage("sam_encoder"):
             pixels = sam_pixels.to(model.dtype)
-            features = encode(model.sam.vision_encoder, pixels, [frame.sam_plan for frame in frames])
+            features = encode(
+                model.sam.vision_encoder,
+                pixels,
+                [frame.sam_plan for frame in frames],
+                run_whole=model.stacks.sam,
+                run_block=model.stacks.sam_tokens,
+            )
         with timer.stage("mask_decoder"):
             sparse = [segmentation_embeddings(model, answer.states) for answer in answers]
             low_resolution = decode_masks(model.sam, features, sparse)
@@ -123,9 +133,6 @@ class LisaPipeline:
                 for masks, frame in zip(low_resolution, frames, strict=True)
             ]
         return self._collected(prompts, images, answers, logits, timer.durations_ns())
-
-    def _on_device(self, arrays: Sequence[Float32Array]) -> torch.Tensor:
-        return torch.from_numpy(np.stack(arrays)).to(self.loaded.model.device)
 
     def _image_tokens(self, pixels: torch.Tensor, frames: Sequence[FrameInput]) -> list[ImageTokens]:
         """The visual tokens of each frame that enter the language model."""

@@ -8,7 +8,7 @@ global attention frame by frame on that frame's tokens.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +60,14 @@ class PackedTokens:
     """Tokens of each frame."""
 
 
-def encode(vision_encoder: HfModule, pixels: Tensor, plans: Sequence[SamPlan | None] | None = None) -> SamFeatures:
+def encode(
+    vision_encoder: HfModule,
+    pixels: Tensor,
+    plans: Sequence[SamPlan | None] | None = None,
+    *,
+    run_whole: Callable[[HfModule, Tensor], Tensor] | None = None,
+    run_block: Callable[..., Tensor] | None = None,
+) -> SamFeatures:
     """Encodes frames, each whole or in part.
 
     Frames that are whole go through the unmodified module, in one batch. In the other frames, windows that are computed
@@ -72,6 +79,8 @@ def encode(vision_encoder: HfModule, pixels: Tensor, plans: Sequence[SamPlan | N
         vision_encoder: ``SamModel.vision_encoder``.
         pixels: [B, 3, S, S], normalised and padded, in the encoder's dtype.
         plans: One per frame, None for a whole frame; None for whole frames only.
+        run_whole: Runs the encoder on whole frames; None = its own forward.
+        run_block: Stands in for `run_layer`, a compiled one for example.
 
     Raises:
         ModelError: shapes or plans that don't fit the encoder.
@@ -82,10 +91,11 @@ def encode(vision_encoder: HfModule, pixels: Tensor, plans: Sequence[SamPlan | N
     whole = [i for i in range(len(pixels)) if i not in partial]
     found: dict[int, FrameFeatures] = {}
     if whole:
-        maps = vision_encoder(pixels if not partial else pixels[whole])[0]
+        chosen = pixels if not partial else pixels[whole]
+        maps = vision_encoder(chosen)[0] if run_whole is None else run_whole(vision_encoder, chosen)
         found.update((i, FrameFeatures(values)) for i, values in zip(whole, maps, strict=True))
     if partial:
-        found.update(zip(partial, encode_tokens(vision_encoder, pixels, partial), strict=True))
+        found.update(zip(partial, encode_tokens(vision_encoder, pixels, partial, run_block), strict=True))
     return SamFeatures(tuple(found[i] for i in range(len(pixels))), grid.side)
 
 
@@ -109,7 +119,12 @@ def check_batch(grid: SamGrid, pixels: Tensor, plans: Sequence[SamPlan | None] |
         raise ModelError(f"a SAM plan was made for other sizes than this encoder's {grid}; plan with grid_of(encoder)")
 
 
-def encode_tokens(encoder: HfModule, pixels: Tensor, plans: Mapping[int, SamPlan]) -> list[FrameFeatures]:
+def encode_tokens(
+    encoder: HfModule,
+    pixels: Tensor,
+    plans: Mapping[int, SamPlan],
+    run_block: Callable[..., Tensor] | None = None,
+) -> list[FrameFeatures]:
     """Encodes the planned tokens of the frames ``pixels[i]``, for every i of ``plans``, in that order."""
     layouts = [(frame, plan.layout()) for frame, plan in plans.items()]
     packed, side = pack(layouts, pixels.device), grid_of(encoder).side
@@ -118,7 +133,7 @@ def encode_tokens(encoder: HfModule, pixels: Tensor, plans: Mapping[int, SamPlan
         return [FrameFeatures(nothing, packed.rows) for _ in plans]
     hidden = embed_patches(encoder, pixels, packed)
     for layer in encoder.layers:
-        hidden = run_layer(layer, hidden, packed)
+        hidden = (run_block or run_layer)(layer, hidden, packed)
     values = run_neck(encoder.neck, hidden, neighbour_indexes(layouts, side).to(pixels.device))
     indexes = torch.split(packed.rows * side + packed.columns, packed.counts)
     return [FrameFeatures(*part) for part in zip(torch.split(values, packed.counts), indexes, strict=True)]
