@@ -21,7 +21,7 @@ demo: $(READY)   ## stream a driving clip edge -> cloud -> edge over loopback; w
 	$(BIN)/cable-rpc demo --out out/demo
 
 test: $(READY)   ## all checks and tests (under 8 minutes on 2 cores)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadscope
 
 test-slow: $(READY)  ## the slower checks
 	$(BIN)/python -m pytest -m slow --timeout 1800
