@@ -14,9 +14,12 @@ import cable_rpc
 from cable_rpc.cli.codec_study import codec_study
 from cable_rpc.cli.demo import demo
 from cable_rpc.cli.doctor import doctor
+from cable_rpc.cli.export import export_app
 from cable_rpc.cli.inspect import inspect
 from cable_rpc.cli.serve import serve
 from cable_rpc.cli.stream import stream
+from cable_rpc.cli.train import train_app
+from cable_rpc.cli.train_segmenter import segmenter
 from cable_rpc.cli.verify import verify_app
 from cable_rpc.errors import CableError
 
@@ -35,6 +38,9 @@ app.command()(inspect)
 app.command()(codec_study)
 app.command()(doctor)
 app.add_typer(verify_app, name="verify")
+app.add_typer(export_app, name="export")
+train_app.command()(segmenter)
+app.add_typer(train_app, name="train")
 
 
 def _version(wanted: bool) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
@@ -50,6 +50,15 @@ class Detector(Protocol):
 
     def detect(self, images: Sequence[Image]) -> list[Detections]:
         """Boxes for each uint8 [H, W, 3] BGR image, best score first, in pixels of that image."""
+        ...
+
+
+@runtime_checkable
+class RegionDetector(Protocol):
+    """A detector that makes use of where objects can be. A caller with regions asks it in place of ``detect``."""
+
+    def detect_regions(self, images: Sequence[Image], regions: Sequence[BoolMask | None]) -> list[Detections]:
+        """Boxes for each uint8 [H, W, 3] BGR image, in pixels of all of it; regions bool [H, W], None = everywhere."""
         ...
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cable_rpc.cloud.backends import Detector, FrameContext, Segmenter
+from cable_rpc.cloud.backends import Detector, FrameContext, RegionDetector, Segmenter
 from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
 from cable_rpc.errors import ModelError
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
@@ -79,7 +79,7 @@ class PerceptionModels:
             sequence: the camera's frame number.
             stream: the camera's session.
         """
-        detected = await self._detector_runner.infer(lambda: self.detector.detect([image])[0])
+        detected = await self._detector_runner.infer(lambda: _detect(self.detector, image, roi))
         detections = detected.value.select(detected.value.scores >= min_score)
         context = FrameContext(sequence, detections, stream)
         segmented = await self._segmenter_runner.infer(
@@ -108,6 +108,13 @@ class PerceptionModels:
             await self._segmenter_runner.infer(lambda: forget(stream))
         except Exception:
             log.exception("segmenter %s did not forget session %s", self.segmenter.name, stream)
+
+
+def _detect(detector: Detector, image: Image, roi: BoolMask | None) -> Detections:
+    """Boxes of a picture; a detector that can look at a region closely is told which."""
+    if roi is not None and isinstance(detector, RegionDetector):
+        return detector.detect_regions([image], [roi])[0]
+    return detector.detect([image])[0]
 
 
 def _inside(

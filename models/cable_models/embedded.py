@@ -20,6 +20,6 @@ def embedded_detector_path() -> Path:
     if not path.is_file():
         raise ModelError(
             f"the embedded detector {path} is missing from this installation; reinstall the package, "
-            "train it with `python -m cable_rpc.study.train_embedded`, or name an ONNX file of your own"
+            "train it with `cable-rpc train detector`, or name an ONNX file of your own"
         )
     return path

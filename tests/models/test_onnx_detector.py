@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 onnx = pytest.importorskip("onnx", reason="building test graphs needs onnx")
 ort = pytest.importorskip("onnxruntime", reason="the detector runs on onnxruntime")
 
-from cable_models.rtdetr import OnnxDetector  # noqa: E402
+from cable_models.rtdetr import CropConfig, DetectorSettings, OnnxDetector, SessionSettings  # noqa: E402
 from cable_models.rtdetr.labels import COCO80_NAMES, coco_index_table  # noqa: E402
 from cable_models.rtdetr.postprocess import decode_logits, first_of_duplicates, pairwise_iou  # noqa: E402
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
@@ -143,7 +144,7 @@ def test_rtdetr_layout_gives_pixels_of_each_original_image(tmp_path: Path, batch
         tmp_path / "a.onnx", [2, 0, 11, 7], [[0.1, 0.2, 0.5, 0.6], [0.6, 0, 0.7, 1], [0, 0, 1, 1], [0, 0, 1, 1]],
         [0.9, 0.5, 0.99, 0.39], batch,
     )  # fmt: skip
-    detector = OnnxDetector(path, providers=["CPUExecutionProvider"])
+    detector = OnnxDetector(path, SessionSettings(provider="cpu"))
     assert (detector.signature, detector.input_size_wh, detector.name) == ("rtdetr", (48, 32), "a")
     images = [black, np.zeros((50, 400, 3), np.uint8)] * 2
     found = detector.detect(images)
@@ -160,7 +161,9 @@ def test_rtdetr_layout_gives_pixels_of_each_original_image(tmp_path: Path, batch
 
 
 def test_network_sees_rgb_in_0_to_1(tmp_path: Path, black: np.ndarray) -> None:
-    detector = OnnxDetector(rtdetr_graph(tmp_path / "a.onnx", [2], [[0, 0, 1, 1]], [0.0]), min_score=0.1)
+    detector = OnnxDetector(
+        rtdetr_graph(tmp_path / "a.onnx", [2], [[0, 0, 1, 1]], [0.0]), settings=DetectorSettings(min_score=0.1)
+    )
     red = black.copy()
     red[..., 2] = 204
     results = detector.detect([red, black, red])
@@ -205,12 +208,14 @@ def test_second_label_of_one_object_is_dropped_but_neighbours_stay(tmp_path: Pat
     (found,) = OnnxDetector(path).detect([black])
     # truck .6 is the car .9 again, and bicycle .41 the motorcycle .45; a person there is someone else
     assert found.class_ids.tolist() == [2, 0, 2, 3]
+    (everything,) = OnnxDetector(path, settings=DetectorSettings(deduplicate=False)).detect([black])
+    assert everything.class_ids.tolist() == [2, 0, 7, 2, 3, 1]
 
 
 def test_only_wanted_classes_and_scores_are_reported(tmp_path: Path, black: np.ndarray) -> None:
     boxes = [[0, 0, 0.2, 0.2], [0.4, 0.4, 0.6, 0.6], [0.7, 0.7, 1, 1]]
     path = rtdetr_graph(tmp_path / "a.onnx", [2, 11, 0], boxes, [0.3, 0.9, 0.9])
-    (found,) = OnnxDetector(path, min_score=0.25, class_ids=(2, 11)).detect([black])
+    (found,) = OnnxDetector(path, settings=DetectorSettings(0.25, (2, 11))).detect([black])
     assert found.class_ids.tolist() == [11, 2]
     assert OnnxDetector(path).detect([]) == []
 
@@ -326,13 +331,19 @@ def test_class_counts_must_fit_the_labels(
 
 
 @pytest.mark.parametrize(
-    "settings_",
-    [{"threads": 0}, {"min_score": 1.5}, {"class_ids": (2, 80)}, {"providers": ["NoSuchProvider"]}, {"providers": []}],
+    ("make", "message"),
+    [
+        (lambda: SessionSettings(threads=0), "threads"),
+        (lambda: SessionSettings(device_id=-1), "GPU"),
+        (lambda: DetectorSettings(min_score=1.5), "min_score"),
+        (lambda: DetectorSettings(class_ids=(2, 80)), "80"),
+        (lambda: DetectorSettings(max_batch=0), "max_batch"),
+        (lambda: CropConfig(min_share=0), "crop"),
+    ],
 )
-def test_impossible_settings_are_refused(tmp_path: Path, settings_: dict) -> None:
-    path = rtdetr_graph(tmp_path / "a.onnx", [2], [[0, 0, 1, 1]], [0.9])
-    with pytest.raises(ModelError):
-        OnnxDetector(path, **settings_)
+def test_impossible_settings_are_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        make()
 
 
 def kitti_cars(frame: int, min_height: float) -> np.ndarray:
@@ -347,7 +358,7 @@ def kitti_cars(frame: int, min_height: float) -> np.ndarray:
 
 @pytest.mark.skipif(not (FEMTO.is_file() and KITTI.is_dir()), reason="shared weights or KITTI frames are absent")
 def test_real_detector_finds_the_large_free_cars_of_kitti() -> None:
-    detector = OnnxDetector(FEMTO, min_score=0.3)
+    detector = OnnxDetector(FEMTO, settings=DetectorSettings(min_score=0.3))
     assert detector.signature == "rtdetr"
     truth = {frame: boxes for frame in range(36, 66) if len(boxes := kitti_cars(frame, min_height=30))}
     overlaps: list[float] = []

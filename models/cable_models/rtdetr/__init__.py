@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
-from cable_models.rtdetr.onnx_detector import OnnxDetector
+from cable_models.rtdetr.crop import CropConfig
+from cable_models.rtdetr.onnx_detector import DetectorSettings, OnnxDetector
+from cable_models.rtdetr.providers import ProviderChoice, SessionSettings
 
-__all__ = ["OnnxDetector"]
+__all__ = ["CropConfig", "DetectorSettings", "OnnxDetector", "ProviderChoice", "SessionSettings"]

@@ -1,10 +1,13 @@
-"""Exports a trained RT-DETR to ONNX and proves that the file answers as torch does."""
+"""Exports RT-DETR to ONNX: a published checkpoint or the compact network of this package, by one way."""
 
 from __future__ import annotations
 
-import json
+import logging
+import warnings
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -14,24 +17,19 @@ from transformers import RTDetrForObjectDetection
 
 from cable_models.detection import DetectedBoxes, Image
 from cable_models.errors import ModelError
+from cable_models.rtdetr.checkpoints import Checkpoint, compact_checkpoint
 from cable_models.rtdetr.compact import CompactRtDetrConfig
+from cable_models.rtdetr.file_facts import metadata_of
+from cable_models.rtdetr.file_plan import GraphOptions
 from cable_models.rtdetr.labels import coco_index_table
-from cable_models.rtdetr.onnx_detector import OnnxDetector
-from cable_models.rtdetr.postprocess import decode_logits, select_detections
-from cable_models.rtdetr.preprocess import fill_input
-
-OPSET = 17
-BOX_TOLERANCE_PX = 0.5
-SCORE_TOLERANCE = 1e-3
-COMPARED_SCORE = 0.1
-
-PREPROCESSING = "BGR to RGB, straight bilinear resize to the input size, divide by 255, NCHW; no mean or deviation"
+from cable_models.rtdetr.postprocess import select_detections
+from cable_models.rtdetr.verify import check_export, require, torch_answer
 
 
 class LogitsAndBoxes(nn.Module):
     """The two tensors of the published transformers export, without the rest of the output object."""
 
-    def __init__(self, model: RTDetrForObjectDetection) -> None:
+    def __init__(self, model: nn.Module) -> None:
         super().__init__()
         self.model = model
 
@@ -41,10 +39,121 @@ class LogitsAndBoxes(nn.Module):
         return output.logits, output.pred_boxes
 
 
+class LabelsBoxesScores(nn.Module):
+    """The original repository's signature: post-processing as in `decode_logits`, inside the graph."""
+
+    def __init__(self, model: nn.Module) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(
+        self, images: torch.Tensor, orig_target_sizes: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Best score first.
+
+        Args:
+            images: float [N, 3, H, W].
+            orig_target_sizes: int64 [N, 2], width and height of each original image.
+
+        Returns:
+            ``labels`` int64 [N, queries], ``boxes`` [N, queries, 4] xyxy in pixels, ``scores`` [N, queries].
+        """
+        output = self.model(pixel_values=images)
+        queries, classes = output.logits.shape[1:]
+        best, index = torch.topk(output.logits.flatten(1), queries, dim=1)
+        chosen = output.pred_boxes.gather(1, (index // classes).unsqueeze(-1).expand(-1, -1, 4))
+        centre, half = chosen[..., :2], chosen[..., 2:] / 2
+        scale = orig_target_sizes.to(chosen.dtype).repeat(1, 2).unsqueeze(1)
+        boxes = torch.cat([centre - half, centre + half], dim=-1) * scale
+        return index % classes, boxes, best.sigmoid()
+
+
+def export_checkpoint(
+    checkpoint: Checkpoint, path: Path, options: GraphOptions | None = None, notes: Mapping[str, str] | None = None
+) -> None:
+    """Writes the graph (image size fixed, batch free unless asked otherwise) with its facts in the metadata.
+
+    Args:
+        checkpoint: What to export.
+        path: ONNX file to write.
+        options: Form of the graph.
+        notes: Further metadata.
+
+    Raises:
+        ModelError: the file can't be written.
+    """
+    options = options or GraphOptions()
+    try:
+        trace(checkpoint.model, checkpoint.recipe.size_wh, path, options)
+        add_metadata(
+            path,
+            metadata_of(
+                checkpoint.labels, checkpoint.recipe, {**checkpoint.notes, **tool_versions(options), **(notes or {})}
+            ),
+        )
+    except OSError as error:
+        raise ModelError(f"{path} can't be written: {error}") from error
+
+
+def trace(model: nn.Module, size_wh: tuple[int, int], path: Path, options: GraphOptions) -> None:
+    """Runs torch's exporter."""
+    # two images, so that no axis of length 1 is taken for one to broadcast over
+    pixels = torch.zeros(options.batch or 2, 3, size_wh[1], size_wh[0])
+    if options.postprocess:
+        network: nn.Module = LabelsBoxesScores(model)
+        example: tuple[torch.Tensor, ...] = (pixels, torch.tensor([size_wh] * len(pixels)))
+        names = (["images", "orig_target_sizes"], ["labels", "boxes", "scores"])
+    else:
+        network, example = LogitsAndBoxes(model), (pixels,)
+        names = (["pixel_values"], ["logits", "pred_boxes"])
+    axes = None if options.batch else {name: {0: "batch"} for name in (*names[0], *names[1])}
+    exporter_log = logging.getLogger("torch.onnx")
+    level = exporter_log.level
+    exporter_log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            # it warns of every constant that it makes of the fixed image size, and of its own age
+            warnings.simplefilter("ignore")
+            # the exporter that is not based on dynamo: the newer one froze the batch at the example's size
+            torch.onnx.export(
+                network.train(False),
+                example,
+                str(path),
+                input_names=names[0],
+                output_names=names[1],
+                dynamic_axes=axes,
+                opset_version=options.opset,
+                dynamo=False,
+            )
+    finally:
+        exporter_log.setLevel(level)
+
+
+def tool_versions(options: GraphOptions) -> dict[str, str]:
+    """What made the file."""
+    packages = {f"{name}_version": version(name) for name in ("torch", "transformers", "onnx")}
+    return {"opset": str(options.opset), "precision": "fp32", **packages}
+
+
+def add_metadata(path: Path, entries: Mapping[str, str]) -> None:
+    """Adds or replaces metadata entries of an ONNX file, which is checked on the way.
+
+    Raises:
+        ModelError: the graph is not valid.
+    """
+    graph: Any = onnx.load(str(path))
+    onnx.helper.set_model_props(graph, {**{entry.key: entry.value for entry in graph.metadata_props}, **entries})
+    try:
+        onnx.checker.check_model(graph)
+    except onnx.checker.ValidationError as error:
+        raise ModelError(f"{path} is no valid ONNX graph: {error}") from error
+    onnx.save(graph, str(path))
+
+
 def export_onnx(
     model: RTDetrForObjectDetection, config: CompactRtDetrConfig, path: Path, notes: Mapping[str, str]
 ) -> None:
-    """Writes the graph (batch dynamic, image size fixed) with everything a reader needs in its metadata.
+    """Exports a compact network; see `export_checkpoint`.
 
     Args:
         model: Trained model.
@@ -52,42 +161,13 @@ def export_onnx(
         path: ONNX file to write.
         notes: Further metadata, such as ``source`` and ``licence``.
     """
-    width, height = config.input_size_wh
-    # the exporter that is not based on dynamo: the newer one froze the batch at the example's size
-    torch.onnx.export(
-        LogitsAndBoxes(model).train(False),
-        (torch.zeros(2, 3, height, width),),
-        str(path),
-        input_names=["pixel_values"],
-        output_names=["logits", "pred_boxes"],
-        dynamic_axes={name: {0: "batch"} for name in ("pixel_values", "logits", "pred_boxes")},
-        opset_version=OPSET,
-        dynamo=False,
-    )
-    graph = onnx.load(str(path))
-    metadata = {
-        "labels": json.dumps(dict(enumerate(config.labels))),
-        "input_width": str(width),
-        "input_height": str(height),
-        "preprocessing": PREPROCESSING,
-        "architecture": "RT-DETR (RTDetrForObjectDetection of transformers), compact configuration",
-        **notes,
-    }
-    onnx.helper.set_model_props(graph, metadata)
-    onnx.checker.check_model(graph)
-    onnx.save(graph, str(path))
+    export_checkpoint(compact_checkpoint(model, config, notes), path)
 
 
 def verify_export(
     model: RTDetrForObjectDetection, config: CompactRtDetrConfig, path: Path, images: Sequence[Image]
 ) -> tuple[float, float]:
-    """Compares the detections of torch and of ONNX Runtime on real images, nearest to nearest.
-
-    Args:
-        model: The exported model.
-        config: Its size and labels.
-        path: The ONNX file.
-        images: uint8 [height, width, 3] BGR, run as one batch by ONNX Runtime and one by one by torch.
+    """Compares a compact network with its exported file; see `check_export`.
 
     Returns:
         Largest difference of a box side in pixels, and of a score.
@@ -95,50 +175,22 @@ def verify_export(
     Raises:
         ModelError: they differ by more than 0.5 px or 0.001, or one finds an object that the other doesn't.
     """
-    # a margin under the compared score, so that no detection is missed for lying on the threshold
-    low = COMPARED_SCORE - 2 * SCORE_TOLERANCE
-    detector = OnnxDetector(path, providers=["CPUExecutionProvider"], min_score=low)
-    worst_box = worst_score = 0.0
-    for image, found in zip(images, detector.detect(images), strict=True):
-        expected = detect_with_torch(model, config, image, low)
-        for first, second in ((expected, found), (found, expected)):
-            box, score = largest_difference(first.select(first.scores >= COMPARED_SCORE), second)
-            worst_box, worst_score = max(worst_box, box), max(worst_score, score)
-    if worst_box > BOX_TOLERANCE_PX or worst_score > SCORE_TOLERANCE:
-        raise ModelError(
-            f"{path} differs from torch by {worst_box:.3f} px and {worst_score:.5f} in score; "
-            f"allowed are {BOX_TOLERANCE_PX} px and {SCORE_TOLERANCE}. Don't ship it"
-        )
-    return worst_box, worst_score
-
-
-def largest_difference(wanted: DetectedBoxes, offered: DetectedBoxes) -> tuple[float, float]:
-    """Largest box (pixels) and score difference from each wanted detection to its nearest of the same class."""
-    if not len(wanted):
-        return 0.0, 0.0
-    if not len(offered):
-        return float("inf"), float("inf")
-    box = np.abs(wanted.boxes_xyxy[:, None] - offered.boxes_xyxy[None]).max(axis=2)
-    box = np.where(wanted.class_ids[:, None] == offered.class_ids[None], box, np.inf)
-    nearest = box.argmin(axis=1)
-    score = np.abs(wanted.scores - offered.scores[nearest])
-    return float(box.min(axis=1).max()), float(score.max())
+    check = check_export(compact_checkpoint(model, config, {}), path, images)
+    require(check, path)
+    return check.box_px, check.score
 
 
 def detect_with_torch(
     model: RTDetrForObjectDetection, config: CompactRtDetrConfig, image: Image, min_score: float
 ) -> DetectedBoxes:
-    """Detections of one image, all classes, without ONNX."""
-    width, height = config.input_size_wh
-    tensor = np.empty((1, 3, height, width), np.float32)
-    fill_input([image], tensor)
-    with torch.inference_mode():
-        output = model.train(False)(pixel_values=torch.from_numpy(tensor))
-    size_wh = (image.shape[1], image.shape[0])
+    """Detections of one image by a compact network, all COCO classes, without ONNX."""
+    raw = torch_answer(compact_checkpoint(model, config, {}), image)
     return select_detections(
-        *decode_logits(output.logits[0].numpy(), output.pred_boxes[0].numpy(), size_wh),
+        raw.class_ids.astype(np.int64),
+        raw.boxes_xyxy,
+        raw.scores,
         coco_index=coco_index_table(dict(enumerate(config.labels))),
         wanted=np.ones(80, np.bool_),
         min_score=min_score,
-        size_wh=size_wh,
+        size_wh=(image.shape[1], image.shape[0]),
     )

@@ -102,8 +102,13 @@ ALIASES: Mapping[str, str] = {
     "motorcyclist": "motorcycle",
     "van": "car",
     "lorry": "truck",
+    "aeroplane": "airplane",
+    "sofa": "couch",
+    "pottedplant": "potted plant",
+    "diningtable": "dining table",
+    "tvmonitor": "tv",
 }
-"""Names of driving data sets to the COCO name of the class that stands for them here."""
+"""Other names (driving data sets; the published RT-DETR checkpoints) to the COCO name that stands for them here."""
 
 COCO_GROUP_OF: Mapping[int, int] = {0: 0, 1: 1, 3: 1, 2: 2, 5: 2, 7: 2}
 """Class id to the group in which one object may carry several labels: pedestrian, cyclist, vehicle."""

@@ -2,25 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import onnxruntime as ort
 
 from cable_models.detection import DetectedBoxes, Image
 from cable_models.errors import ModelError
-from cable_models.rtdetr.labels import COCO80_NAMES, coco_index_table, parse_labels
+from cable_models.rtdetr.crop import BoolMask, CropConfig, Window, crop_window
+from cable_models.rtdetr.file_facts import labels_of, recipe_of
+from cable_models.rtdetr.graph_runner import GraphRunner
+from cable_models.rtdetr.labels import COCO80_NAMES, coco_index_table
 from cable_models.rtdetr.postprocess import decode_logits, select_detections
-from cable_models.rtdetr.preprocess import check_image, fill_input
+from cable_models.rtdetr.preprocess import Resample, check_image, fill_input
+from cable_models.rtdetr.providers import ProviderChoice, SessionSettings
 from cable_models.rtdetr.signature import SignatureName, read_signature
 
 ROAD_USER_CLASSES = (0, 1, 2, 3, 5, 7)
 """person, bicycle, car, motorcycle, bus and truck by contiguous COCO-80 index."""
 
 RawDetections = tuple[npt.NDArray[np.int64], npt.NDArray[np.float32], npt.NDArray[np.float32]]
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSettings:
+    """What is reported, and from which pixels."""
+
+    min_score: float = 0.4
+    """Lowest score reported, 0..1."""
+    class_ids: tuple[int, ...] = ROAD_USER_CLASSES
+    """COCO-80 classes to report."""
+    deduplicate: bool = True
+    """Report an object once where the network gives it two labels of one group, such as car and truck."""
+    resample: Resample | None = None
+    """Resize filter instead of the file's own."""
+    crop: CropConfig | None = None
+    """Cut images to a window around their region of interest first, where `OnnxDetector.detect` is given one."""
+    max_batch: int | None = None
+    """Most images in one run of a graph whose batch is free; None = all that a call brings."""
+
+    def __post_init__(self) -> None:
+        """Refuses settings that can't work.
+
+        Raises:
+            ModelError: which one, and its range.
+        """
+        if not 0 <= self.min_score <= 1:
+            raise ModelError(f"min_score must lie in 0..1, got {self.min_score}")
+        unknown = [index for index in self.class_ids if not 0 <= index < len(COCO80_NAMES)]
+        if unknown:
+            raise ModelError(f"class_ids must be COCO-80 indices 0..79, got {unknown}")
+        if self.max_batch is not None and self.max_batch < 1:
+            raise ModelError(f"max_batch must be at least 1, got {self.max_batch}")
 
 
 class OnnxDetector:
@@ -30,7 +67,7 @@ class OnnxDetector:
     at a time: the input tensor is kept between calls.
 
     Example:
-        >>> detector = OnnxDetector("rtdetr_r50vd.onnx", threads=4)  # doctest: +SKIP
+        >>> detector = OnnxDetector("rtdetr_r50vd.onnx", SessionSettings(threads=4))  # doctest: +SKIP
         >>> detector.detect([image])[0].class_ids  # doctest: +SKIP
         array([2, 2, 0], dtype=int32)
     """
@@ -38,44 +75,49 @@ class OnnxDetector:
     def __init__(
         self,
         path: str | Path,
-        *,
-        providers: Sequence[str] | None = None,
-        threads: int = 1,
-        min_score: float = 0.4,
-        class_ids: Sequence[int] = ROAD_USER_CLASSES,
+        session: SessionSettings | None = None,
+        settings: DetectorSettings | None = None,
     ) -> None:
         """Loads the graph and checks that it can be used.
 
         Args:
             path: ONNX file.
-            providers: ONNX Runtime execution providers in order of preference; None takes CUDA where this
-                build of ONNX Runtime offers it, else the CPU. ``provider`` says which one serves.
-            threads: CPU threads inside one inference.
-            min_score: Lowest score reported, 0..1.
-            class_ids: COCO-80 classes to report.
+            session: How it is run.
+            settings: What it reports.
 
         Raises:
-            ModelError: no such file, not an ONNX model, an unknown layout, unknown classes or provider.
+            ModelError: no such file, not an ONNX model, an unknown layout, labels that don't fit, a provider
+                that is unknown or does not start.
         """
-        check_settings(threads, min_score, class_ids)
         self.path = Path(path)
-        self.min_score = min_score
-        self.session = open_session(self.path, choose_providers(providers), threads)
-        self.provider: str = self.session.get_providers()[0]
-        if providers is not None and self.provider != providers[0]:
-            raise ModelError(f"provider {providers[0]} could not start for {self.path}; {self.provider} did instead")
-        metadata: dict[str, str] = dict(self.session.get_modelmeta().custom_metadata_map)
-        self.layout = read_signature(self.session.get_inputs(), self.session.get_outputs(), metadata)
-        self.labels = labels_of(metadata, self.layout.class_count, self.path)
+        self.settings = settings or DetectorSettings()
+        session = session or SessionSettings()
+        self.runner = GraphRunner(self.path, session)
+        self.workers = ThreadPoolExecutor(session.threads, "prepare") if session.threads > 1 else None
+        self.metadata = self.runner.metadata
+        graph = self.runner.session
+        self.layout = read_signature(graph.get_inputs(), graph.get_outputs(), self.metadata)
+        self.labels = labels_of(self.metadata, self.layout.class_count, self.path)
+        self.recipe = recipe_of(self.metadata, self.layout.size_wh, self.settings.resample)
         self.coco_index = coco_index_table(self.labels)
         self.wanted = np.zeros(len(COCO80_NAMES), np.bool_)
-        self.wanted[list(class_ids)] = True
+        self.wanted[list(self.settings.class_ids)] = True
         self.tensor = self.input_tensor(self.layout.fixed_batch or 1)
 
     @property
     def name(self) -> str:
         """File name without its ending."""
         return self.path.stem
+
+    @property
+    def provider(self) -> str:
+        """The execution provider that runs the graph, by ONNX Runtime's name."""
+        return self.provider_choice.serving
+
+    @property
+    def provider_choice(self) -> ProviderChoice:
+        """What was asked for, what runs, and why they differ if they do."""
+        return self.runner.choice
 
     @property
     def input_size_wh(self) -> tuple[int, int]:
@@ -87,32 +129,58 @@ class OnnxDetector:
         """``rtdetr`` or ``transformers``: the graph's layout."""
         return self.layout.name
 
-    def detect(self, images: Sequence[Image]) -> list[DetectedBoxes]:
+    def detect(self, images: Sequence[Image], regions: Sequence[BoolMask | None] | None = None) -> list[DetectedBoxes]:
         """Finds the wanted objects in each image.
 
         Args:
             images: uint8 [height, width, 3] in BGR order; sizes may differ.
+            regions: bool [height, width] or None for each image: where objects can be. Used where the settings
+                ask for a crop, ignored otherwise.
 
         Returns:
-            One ``DetectedBoxes`` per image, in the same order.
+            One ``DetectedBoxes`` per image, in the same order, in pixels of the whole image.
 
         Raises:
-            ModelError: an image has another dtype or shape, or the graph failed.
+            ModelError: an image or region has another dtype or shape, or the graph failed.
         """
         for position, image in enumerate(images):
             check_image(image, position)
-        step = self.layout.fixed_batch or max(len(images), 1)
+        windows = self.windows(images, regions)
+        views = [
+            image if window is None else image[window.slices] for image, window in zip(images, windows, strict=True)
+        ]
+        step = self.layout.fixed_batch or self.settings.max_batch or max(len(images), 1)
         found: list[DetectedBoxes] = []
-        for start in range(0, len(images), step):
-            found += self.detect_batch(images[start : start + step])
-        return found
+        for start in range(0, len(views), step):
+            found += self.detect_batch(views[start : start + step])
+        return [
+            boxes
+            if window is None
+            else DetectedBoxes(boxes.boxes_xyxy + window.offset_xyxy, boxes.class_ids, boxes.scores)
+            for boxes, window in zip(found, windows, strict=True)
+        ]
+
+    def windows(self, images: Sequence[Image], regions: Sequence[BoolMask | None] | None) -> Sequence[Window | None]:
+        """The window of each image that the network is shown; None = all of it."""
+        if self.settings.crop is None or regions is None:
+            return [None] * len(images)
+        if len(regions) != len(images):
+            raise ModelError(f"{len(images)} images came with {len(regions)} regions; give one for each, or None")
+        windows: list[Window | None] = []
+        for position, (image, region) in enumerate(zip(images, regions, strict=True)):
+            if region is not None and (region.shape != image.shape[:2] or region.dtype != np.bool_):
+                raise ModelError(
+                    f"region {position} must be bool {list(image.shape[:2])}, got {region.dtype} {list(region.shape)}"
+                )
+            windows.append(None if region is None else crop_window(region, self.settings.crop))
+        return windows
 
     def detect_batch(self, images: Sequence[Image]) -> list[DetectedBoxes]:
         """One run of the graph over images that fit its batch."""
         batch = self.layout.fixed_batch or len(images)
         if len(self.tensor) < batch:
             self.tensor = self.input_tensor(batch)
-        fill_input(images, self.tensor)
+        fill_input(images, self.tensor, self.recipe, self.workers)
         sizes_wh = [(image.shape[1], image.shape[0]) for image in images]
         raw = self.infer(self.tensor[:batch], sizes_wh)
         return [
@@ -120,32 +188,30 @@ class OnnxDetector:
                 *detections,
                 coco_index=self.coco_index,
                 wanted=self.wanted,
-                min_score=self.min_score,
+                min_score=self.settings.min_score,
                 size_wh=size_wh,
+                deduplicate=self.settings.deduplicate,
             )
             for detections, size_wh in zip(raw, sizes_wh, strict=True)
         ]
 
     def infer(self, tensor: npt.NDArray[np.floating[Any]], sizes_wh: list[tuple[int, int]]) -> list[RawDetections]:
-        """Runs the graph; labels, boxes in pixels and scores of each image, unfiltered."""
+        """Runs the graph; labels, boxes in pixels and scores of each image, unfiltered.
+
+        Args:
+            tensor: [N, 3, H, W], N at least the number of sizes: rows beyond only pad a fixed batch.
+            sizes_wh: Width and height of each image before resizing.
+        """
         feed: dict[str, npt.NDArray[Any]] = {self.layout.image_input: tensor}
         count = len(sizes_wh)
         if self.layout.name == "rtdetr":
-            # rows beyond the images only pad a fixed batch
             feed["orig_target_sizes"] = np.array(sizes_wh + [(1, 1)] * (len(tensor) - count), np.int64)
-            labels, boxes, scores = self.run_graph(["labels", "boxes", "scores"], feed)
+            labels, boxes, scores = self.runner.run(("labels", "boxes", "scores"), feed)
             self.check_class_range(int(labels.max(initial=0)) + 1)
             return [(labels[i], boxes[i].astype(np.float32), scores[i].astype(np.float32)) for i in range(count)]
-        logits, boxes = self.run_graph(["logits", "pred_boxes"], feed)
+        logits, boxes = self.runner.run(("logits", "pred_boxes"), feed)
         self.check_class_range(logits.shape[-1])
         return [decode_logits(logits[i], boxes[i], sizes_wh[i]) for i in range(count)]
-
-    def run_graph(self, outputs: list[str], feed: dict[str, npt.NDArray[Any]]) -> list[npt.NDArray[Any]]:
-        """The named outputs of one inference."""
-        try:
-            return list(self.session.run(outputs, feed))
-        except Exception as error:  # ONNX Runtime's exceptions share no narrower base
-            raise ModelError(f"{self.path} failed on input {self.tensor.shape}: {error}") from error
 
     def check_class_range(self, classes: int) -> None:
         """Refuses an answer with more classes than there are labels."""
@@ -156,67 +222,3 @@ class OnnxDetector:
         """A zeroed input of the network's size."""
         width, height = self.layout.size_wh
         return np.zeros((batch, 3, height, width), self.layout.image_dtype)
-
-
-def check_settings(threads: int, min_score: float, class_ids: Sequence[int]) -> None:
-    """Refuses settings that can't work.
-
-    Raises:
-        ModelError: which setting, and its range.
-    """
-    if threads < 1:
-        raise ModelError(f"threads must be at least 1, got {threads}")
-    if not 0 <= min_score <= 1:
-        raise ModelError(f"min_score must lie in 0..1, got {min_score}")
-    unknown = [index for index in class_ids if not 0 <= index < len(COCO80_NAMES)]
-    if unknown:
-        raise ModelError(f"class_ids must be COCO-80 indices 0..79, got {unknown}")
-
-
-def choose_providers(providers: Sequence[str] | None) -> list[str]:
-    """The execution providers to ask for.
-
-    Raises:
-        ModelError: a named provider is not part of this build of ONNX Runtime.
-    """
-    available = ort.get_available_providers()
-    if providers is None:
-        return [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
-    missing = [name for name in providers if name not in available]
-    if missing or not providers:
-        raise ModelError(f"ONNX Runtime has no provider {missing or '(empty list)'}; available are {available}")
-    return list(providers)
-
-
-def open_session(path: Path, providers: list[str], threads: int) -> ort.InferenceSession:
-    """Loads the graph.
-
-    Raises:
-        ModelError: no such file, or ONNX Runtime can't read it.
-    """
-    if not path.is_file():
-        raise ModelError(f"no detector file {path}; give the path of an ONNX export of RT-DETR")
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    try:
-        return ort.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # ONNX Runtime's exceptions share no narrower base
-        raise ModelError(f"{path} is not a usable ONNX model: {error}") from error
-
-
-def labels_of(metadata: Mapping[str, str], class_count: int | None, path: Path) -> dict[int, str]:
-    """Class names by model index: from metadata, else the COCO-80 list for an 80-class model.
-
-    Raises:
-        ModelError: the number of classes and of names differ.
-    """
-    labels = parse_labels(metadata["labels"]) if "labels" in metadata else dict(enumerate(COCO80_NAMES))
-    if class_count is not None and class_count != len(labels):
-        source = "its 'labels' metadata names" if "labels" in metadata else "COCO, assumed without metadata, has"
-        raise ModelError(
-            f"{path} has {class_count} classes but {source} {len(labels)}; add a metadata entry 'labels' "
-            'with JSON {"0": "name", ...} for every class'
-        )
-    return labels

@@ -52,6 +52,7 @@ def select_detections(
     wanted: npt.NDArray[np.bool_],
     min_score: float,
     size_wh: tuple[int, int],
+    deduplicate: bool = True,
 ) -> DetectedBoxes:
     """Thresholds, maps labels to COCO-80, keeps the wanted classes and removes second labels of one object.
 
@@ -63,6 +64,7 @@ def select_detections(
         wanted: bool [80], COCO classes to report.
         min_score: Lowest score reported.
         size_wh: Width and height of the image; boxes are clipped to it.
+        deduplicate: Remove second labels (car and truck, say); False leaves them, as the published processor does.
     """
     confident = np.flatnonzero(scores >= min_score)
     class_ids = coco_index[labels[confident]]
@@ -76,6 +78,8 @@ def select_detections(
     found = DetectedBoxes(boxes, class_ids.astype(np.int32), scores[chosen].astype(np.float32))
     visible = (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
     found = found.select(visible)
+    if not deduplicate:
+        return found
     return found.select(first_of_duplicates(found.boxes_xyxy, group_ids(found.class_ids)))
 
 

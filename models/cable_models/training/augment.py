@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -19,8 +20,8 @@ class AugmentConfig:
 
     flip: float = 0.5
     crop: float = 0.6
-    min_crop: float = 0.55
-    """Smallest crop as a share of the image's width and height."""
+    crop_shares: tuple[float, float] = (0.55, 1.0)
+    """Smallest and largest crop as a share of the image's width and height."""
     colour: float = 0.8
     blacken: float = 0.35
     """Share of images of which only a region around the objects is kept, as an edge uploads them."""
@@ -28,10 +29,22 @@ class AugmentConfig:
 
 
 def augment(
-    sample: LabelledImage, size_wh: tuple[int, int], config: AugmentConfig, rng: np.random.Generator
+    sample: LabelledImage,
+    size_wh: tuple[int, int],
+    config: AugmentConfig,
+    rng: np.random.Generator,
+    focus: int | None = None,
 ) -> LabelledImage:
-    """A changed copy, resized to ``size_wh`` pixels; objects mostly lost to a crop or a fill are dropped."""
-    sample = random_crop(sample, size_wh, config, rng)
+    """A changed copy, resized to ``size_wh`` pixels; objects mostly lost to a crop or a fill are dropped.
+
+    Args:
+        sample: Image and labels.
+        size_wh: Width and height of the result.
+        config: How often and how strongly.
+        rng: Source of all draws.
+        focus: Row of an object that a crop keeps, whole where the crop is large enough.
+    """
+    sample = random_crop(sample, size_wh, config, rng, focus)
     if rng.random() < config.flip:
         sample = mirrored(sample)
     image = sample.image
@@ -47,17 +60,22 @@ def augment(
 
 
 def random_crop(
-    sample: LabelledImage, size_wh: tuple[int, int], config: AugmentConfig, rng: np.random.Generator
+    sample: LabelledImage,
+    size_wh: tuple[int, int],
+    config: AugmentConfig,
+    rng: np.random.Generator,
+    focus: int | None = None,
 ) -> LabelledImage:
     """A random part of the image (or all of it) at the wanted size, aspect ratio jittered by up to 15 %."""
     height, width = sample.image.shape[:2]
     crop_h, crop_w = height, width
     if rng.random() < config.crop:
-        share = rng.uniform(config.min_crop, 1.0)
+        share = rng.uniform(*config.crop_shares)
         crop_h = int(height * min(1.0, share * rng.uniform(0.85, 1.15)))
         crop_w = int(width * share)
-    x = int(rng.integers(0, width - crop_w + 1))
-    y = int(rng.integers(0, height - crop_h + 1))
+    kept_box = np.array([0, 0, width, height]) if focus is None else sample.boxes_xyxy[focus]
+    x = crop_start(width, crop_w, float(kept_box[0]), float(kept_box[2]), rng)
+    y = crop_start(height, crop_h, float(kept_box[1]), float(kept_box[3]), rng)
     part = sample.image[y : y + crop_h, x : x + crop_w]
     image = cv2.resize(part, size_wh, interpolation=cv2.INTER_LINEAR)
     scale = np.array([size_wh[0] / crop_w, size_wh[1] / crop_h] * 2, np.float32)
@@ -65,6 +83,15 @@ def random_crop(
     clipped = np.clip(moved, 0, np.array([*size_wh, *size_wh], np.float32))
     kept = area(clipped) >= MIN_KEPT_AREA * np.maximum(area(moved), 1e-6)
     return LabelledImage(np.asarray(image, np.uint8), clipped[kept], sample.class_ids[kept], sample.visibility[kept])
+
+
+def crop_start(side: int, crop: int, low: float, high: float, rng: np.random.Generator) -> int:
+    """A random start of a crop along one side that keeps the span from ``low`` to ``high`` inside, where it fits."""
+    first = min(max(0, math.ceil(high) - crop), side - crop)
+    last = max(min(math.floor(low), side - crop), 0)
+    if high - low > crop:
+        first, last = min(first, last), max(first, last)
+    return int(rng.integers(first, max(first, last) + 1))
 
 
 def mirrored(sample: LabelledImage) -> LabelledImage:

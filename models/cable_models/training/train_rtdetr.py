@@ -1,18 +1,17 @@
-"""Trains the compact RT-DETR from scratch on labelled images, on a CPU thread or a GPU."""
+"""Trains the compact RT-DETR on labelled images, on a CPU thread or a GPU; can be stopped and continued."""
 
 from __future__ import annotations
 
-import argparse
+import copy
 import json
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from safetensors.torch import load_model, save_model
@@ -20,24 +19,28 @@ from torch import nn
 from transformers import RTDetrForObjectDetection
 
 from cable_models.errors import ModelError
-from cable_models.rtdetr.compact import CompactRtDetrConfig, build_compact_rtdetr, parameter_count
+from cable_models.rtdetr.checkpoints import COMPACT_KEY
+from cable_models.rtdetr.compact import CLASS_PRIOR, CompactRtDetrConfig, build_compact_rtdetr
 from cable_models.rtdetr.export import detect_with_torch
 from cable_models.rtdetr.labels import coco_index_table
-from cable_models.rtdetr.preprocess import fill_input
-from cable_models.training.augment import AugmentConfig, augment
-from cable_models.training.average_precision import ClassFigures, Truth, class_figures
-from cable_models.training.samples import LabelledImage, SampleEntry, learnable, read_entries
+from cable_models.training.dense_loss import DenseHead, dense_loss
+from cable_models.training.detector_batches import Batch, next_batch
+from cable_models.training.detector_evaluation import LOWEST_SCORE, Evaluation, evaluate
+from cable_models.training.detector_state import Progress, load_state, save_state
+from cable_models.training.samples import LabelledImage
+from cable_models.training.sampling import BalancedSampler
 
 log = logging.getLogger(__name__)
-
-OPERATING_SCORE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
 class TrainConfig:
-    """How the embedded detector is trained. The learning rate follows the share of ``minutes`` gone."""
+    """How the embedded detector is trained."""
 
-    minutes: float = 30.0
+    minutes: float = 120.0
+    """Training time in all; the learning rate follows the share that is gone."""
+    steps: int | None = None
+    """Length in steps instead: slower, but the same weights on every machine of one kind."""
     batch: int = 8
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
@@ -45,122 +48,177 @@ class TrainConfig:
     gradient_norm: float = 0.1
     average_decay: float = 0.998
     """Decay of the running average of the weights, which is what is evaluated and kept."""
-    coarse_share: float = 0.45
-    """First share of the time, spent at three quarters of the input size: cheaper steps while shapes form."""
-    checkpoint_minutes: float = 3.0
-    min_height: float = 12 / 540
-    """Smallest object taught and scored, as a share of the image height."""
+    dense_weight: float = 1.0
+    """Weight of the training-only loss with many positives per object."""
+    checkpoint_minutes: float = 5.0
+    min_height_px: float = 10.0
+    """Smallest object taught, in pixels of the network's input."""
     min_visibility: float = 0.25
     seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluation:
-    """Quality on held-out images, by COCO-80 index."""
+class TrainingFiles:
+    """Where a training keeps its results."""
 
-    classes: dict[int, ClassFigures]
+    weights: Path
+    """safetensors file of the best averaged weights so far."""
+    state: Path
+    """Everything that a later sitting needs to go on."""
 
-    @property
-    def mean_ap50(self) -> float:
-        """Mean over the classes that occur."""
-        values = [figures.ap50 for figures in self.classes.values() if figures.objects]
-        return float(np.mean(values)) if values else 0.0
 
-    def as_json(self) -> str:
-        """One line of JSON."""
-        rows = {
-            index: {
-                "objects": figures.objects,
-                "ap50": round(figures.ap50, 4) if figures.objects else None,
-                "precision": round(figures.precision, 4),
-                "recall": round(figures.recall, 4),
-                "f1": round(figures.f1, 4),
-            }
-            for index, figures in self.classes.items()
-        }
-        return json.dumps({"mean_ap50": round(self.mean_ap50, 4), "classes": rows})
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """What a listener hears after each step."""
+
+    progress: Progress
+    share_gone: float
+    """Of the whole training, 0..1."""
+    loss: float
+    evaluation: Evaluation | None
+    """Held-out figures, at checkpoints only."""
+
+
+@dataclass(slots=True)
+class Trainee:
+    """The networks in training."""
+
+    model: RTDetrForObjectDetection
+    average: RTDetrForObjectDetection
+    dense_head: DenseHead
+    optimiser: torch.optim.Optimizer
+    network: CompactRtDetrConfig
+
+    def modules(self) -> dict[str, nn.Module]:
+        """What a state file holds, by name."""
+        return {"model": self.model, "average": self.average, "dense_head": self.dense_head}
 
 
 def train(
-    samples: Iterator[LabelledImage],
+    folder: Path,
     held_out: Sequence[LabelledImage],
     network: CompactRtDetrConfig,
     config: TrainConfig,
-    checkpoint: Path,
+    files: TrainingFiles,
+    *,
+    device: str = "cpu",
+    initial: Path | None = None,
+    listener: Callable[[StepReport], None] = lambda _: None,
+    should_stop: Callable[[], bool] = lambda: False,
     clock: Callable[[], float] = time.monotonic,
-) -> Evaluation:
-    """Trains for ``config.minutes`` and leaves the best averaged weights in ``checkpoint``.
+) -> Progress:
+    """Trains, or goes on where the state file stands, and leaves the best averaged weights behind.
 
     Args:
-        samples: Endless training images.
-        held_out: Images of scenes that are not in ``samples``.
+        folder: Sample folder; images that appear in it meanwhile are taken up.
+        held_out: Images of scenes that are not in ``folder``.
         network: Size of the network.
         config: Schedule.
-        checkpoint: safetensors file to write, replaced whenever the held-out mean AP50 rises.
+        files: Weights and state to write; an existing state is continued.
+        device: torch device.
+        initial: Weights to start from instead of random ones; ignored where a state is continued.
+        listener: Called after each step.
+        should_stop: Asked before each step; a stop leaves a state to continue from.
         clock: Seconds, monotonic.
 
     Returns:
-        The evaluation of the weights in ``checkpoint``.
+        How far the training has come.
+
+    Raises:
+        ModelError: no samples, or a state or initial weights that don't fit.
     """
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
-    model = build_compact_rtdetr(network)
+    trainee = new_trainee(network, config, device, initial)
+    recipe = recipe_text(network, config)
+    progress = Progress()
+    if files.state.is_file():
+        progress = load_state(files.state, trainee.modules(), trainee.optimiser, rng, recipe)
+        log.info("continued at step %d after %.1f minutes", progress.step, progress.seconds / 60)
+    sampler = BalancedSampler(folder)
+    last = saved = clock()
+    while share_gone(config, progress) < 1 and not should_stop():
+        gone = share_gone(config, progress)
+        set_learning_rate(trainee.optimiser, learning_rate(config, progress.step, gone))
+        batch = next_batch(sampler, network, config.batch, config.min_height_px, config.min_visibility, rng)
+        loss = train_step(trainee, batch, config, device)
+        progress.step += 1
+        update_average(
+            trainee.average, trainee.model, min(config.average_decay, (1 + progress.step) / (10 + progress.step))
+        )
+        now = clock()
+        progress.seconds += now - last
+        last = now
+        evaluation = None
+        if now - saved >= 60 * config.checkpoint_minutes:
+            evaluation = keep_better(trainee, held_out, files.weights, progress)
+            save_state(files.state, trainee.modules(), trainee.optimiser, rng, progress, recipe)
+            saved = last = clock()
+        listener(StepReport(progress, gone, loss, evaluation))
+    keep_better(trainee, held_out, files.weights, progress)
+    save_state(files.state, trainee.modules(), trainee.optimiser, rng, progress, recipe)
+    return progress
+
+
+def new_trainee(network: CompactRtDetrConfig, config: TrainConfig, device: str, initial: Path | None) -> Trainee:
+    """Networks and optimiser at the start.
+
+    Raises:
+        ModelError: the initial weights belong to another network.
+    """
+    model = load_weights(network, initial) if initial else build_compact_rtdetr(network)
     average = build_compact_rtdetr(network)
     average.load_state_dict(model.state_dict())
     average.train(False)
-    optimiser = torch.optim.AdamW(parameter_groups(model, config.weight_decay), lr=config.learning_rate)
-    log.info("%d parameters, %.1f minutes", parameter_count(model), config.minutes)
-    start = evaluated = clock()
-    best: Evaluation | None = None
-    losses: list[float] = []
-    step = 0
-    while (gone := (clock() - start) / (60 * config.minutes)) < 1:
-        for group in optimiser.param_groups:
-            group["lr"] = learning_rate(config, step, gone)
-        size_wh = training_size(network.input_size_wh, gone < config.coarse_share)
-        pixels, targets = next_batch(samples, network, config, size_wh, rng)
-        losses.append(train_step(model, optimiser, pixels, targets, config.gradient_norm))
-        step += 1
-        update_average(average, model, min(config.average_decay, (1 + step) / (10 + step)))
-        if clock() - evaluated >= 60 * config.checkpoint_minutes:
-            best = keep_better(average, held_out, network, config, checkpoint, best)
-            log.info("step %d, %.0f%% gone, loss %.2f", step, 100 * gone, float(np.mean(losses[-100:])))
-            evaluated = clock()
-    return keep_better(average, held_out, network, config, checkpoint, best)
+    levels = len(network.stage_channels) - 1
+    head = DenseHead(network.width, len(network.labels), levels, CLASS_PRIOR)
+    nn.ModuleList([model, average, head]).to(device)
+    groups = parameter_groups(nn.ModuleList([model, head]), config.weight_decay)
+    optimiser = torch.optim.AdamW(groups, lr=config.learning_rate)
+    return Trainee(model, average, head, optimiser, network)
 
 
-def train_step(
-    model: RTDetrForObjectDetection,
-    optimiser: torch.optim.Optimizer,
-    pixels: torch.Tensor,
-    targets: list[dict[str, torch.Tensor]],
-    gradient_norm: float,
-) -> float:
+def train_step(trainee: Trainee, batch: Batch, config: TrainConfig, device: str) -> float:
     """One step of gradient descent; returns the loss."""
-    model.train()
-    loss = model(pixel_values=pixels, labels=targets).loss
-    optimiser.zero_grad(set_to_none=True)
+    trainee.model.train()
+    targets = [{name: value.to(device) for name, value in target.items()} for target in batch.targets]
+    output = trainee.model(pixel_values=batch.pixels.to(device), labels=targets)
+    maps = output.encoder_last_hidden_state
+    extra = dense_loss(
+        trainee.dense_head(maps),
+        output.enc_outputs_coord_logits,
+        [(features.shape[2], features.shape[3]) for features in maps],
+        (batch.pixels.shape[3], batch.pixels.shape[2]),
+        targets,
+    )
+    loss = output.loss + config.dense_weight * extra
+    trainee.optimiser.zero_grad(set_to_none=True)
     loss.backward()
-    nn.utils.clip_grad_norm_(model.parameters(), gradient_norm)
-    optimiser.step()
+    for module in (trainee.model, trainee.dense_head):
+        nn.utils.clip_grad_norm_(module.parameters(), config.gradient_norm)
+    trainee.optimiser.step()
     return float(loss.detach())
 
 
-def keep_better(
-    average: RTDetrForObjectDetection,
-    held_out: Sequence[LabelledImage],
-    network: CompactRtDetrConfig,
-    config: TrainConfig,
-    checkpoint: Path,
-    best: Evaluation | None,
-) -> Evaluation:
-    """Evaluates, and writes the weights where they beat the best so far, whose evaluation is returned."""
-    evaluation = evaluate(average, held_out, network, config)
-    log.info("held out: %s", evaluation.as_json())
-    if best is not None and evaluation.mean_ap50 < best.mean_ap50:
-        return best
-    save_model(average, str(checkpoint))
+def keep_better(trainee: Trainee, held_out: Sequence[LabelledImage], weights: Path, progress: Progress) -> Evaluation:
+    """Evaluates the average, and writes it where it beats the best so far."""
+    # judged on the CPU, where it will run
+    evaluation = evaluate_torch(copy.deepcopy(trainee.average).cpu(), held_out, trainee.network)
+    log.info("step %d, held out: %s", progress.step, evaluation.as_json())
+    if evaluation.mean_ap50 > progress.best:
+        progress.best = evaluation.mean_ap50
+        save_model(trainee.average, str(weights), metadata={COMPACT_KEY: json.dumps(asdict(trainee.network))})
     return evaluation
+
+
+def evaluate_torch(
+    model: RTDetrForObjectDetection, held_out: Sequence[LabelledImage], network: CompactRtDetrConfig
+) -> Evaluation:
+    """Held-out figures of a torch model, objects of 6 % of the image height and more."""
+    coco = coco_index_table(dict(enumerate(network.labels)))
+    return evaluate(
+        lambda image: detect_with_torch(model, network, image, LOWEST_SCORE), held_out, [int(index) for index in coco]
+    )
 
 
 def parameter_groups(model: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
@@ -172,17 +230,23 @@ def parameter_groups(model: nn.Module, weight_decay: float) -> list[dict[str, An
     ]
 
 
+def share_gone(config: TrainConfig, progress: Progress) -> float:
+    """Share of the training that is done, by steps where their number is set, else by time."""
+    if config.steps is not None:
+        return progress.step / max(1, config.steps)
+    return progress.seconds / (60 * config.minutes)
+
+
 def learning_rate(config: TrainConfig, step: int, gone: float) -> float:
-    """Linear warm-up over steps, then half a cosine over time down to 2 %."""
+    """Linear warm-up over steps, then half a cosine down to 2 %."""
     warm = min(1.0, (step + 1) / config.warmup_steps)
     return config.learning_rate * warm * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * min(gone, 1.0))))
 
 
-def training_size(size_wh: tuple[int, int], coarse: bool) -> tuple[int, int]:
-    """The input size, or about three quarters of it, in multiples of the coarsest stride."""
-    if not coarse:
-        return size_wh
-    return 32 * math.ceil(0.75 * size_wh[0] / 32), 32 * math.ceil(0.75 * size_wh[1] / 32)
+def set_learning_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
+    """The same rate for all parameters."""
+    for group in optimiser.param_groups:
+        group["lr"] = rate
 
 
 @torch.no_grad()
@@ -196,94 +260,12 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
             value.copy_(current[name])
 
 
-def next_batch(
-    samples: Iterator[LabelledImage],
-    network: CompactRtDetrConfig,
-    config: TrainConfig,
-    size_wh: tuple[int, int],
-    rng: np.random.Generator,
-) -> tuple[torch.Tensor, list[dict[str, torch.Tensor]]]:
-    """The next augmented batch: pixels float32 [N, 3, H, W] and targets as transformers wants them."""
-    class_of = {int(coco): index for index, coco in enumerate(coco_index_table(dict(enumerate(network.labels))))}
-    images, targets = [], []
-    for _ in range(config.batch):
-        sample = augment(next(samples), size_wh, AugmentConfig(), rng)
-        boxes = sample.boxes_xyxy
-        taught = learnable(boxes, sample.visibility, size_wh[1], config.min_height, config.min_visibility)
-        taught &= np.isin(sample.class_ids, list(class_of))
-        corners = boxes[taught] / np.array([*size_wh, *size_wh], np.float32)
-        low, high = corners[:, :2], corners[:, 2:]
-        centre_size = np.concatenate([(low + high) / 2, high - low], axis=1)
-        labels = [class_of[int(index)] for index in sample.class_ids[taught]]
-        images.append(sample.image)
-        targets.append(
-            {
-                "class_labels": torch.tensor(labels, dtype=torch.int64),
-                "boxes": torch.from_numpy(centre_size.astype(np.float32)),
-            }
-        )
-    tensor = np.empty((len(images), 3, size_wh[1], size_wh[0]), np.float32)
-    fill_input(images, tensor)
-    return torch.from_numpy(tensor), targets
-
-
-def evaluate(
-    model: RTDetrForObjectDetection,
-    held_out: Sequence[LabelledImage],
-    network: CompactRtDetrConfig,
-    config: TrainConfig,
-) -> Evaluation:
-    """AP50 and figures at the operating score for every class, on images as a user would give them."""
-    table = coco_index_table(dict(enumerate(network.labels)))
-    truth = [
-        Truth(
-            sample.boxes_xyxy,
-            sample.class_ids,
-            learnable(
-                sample.boxes_xyxy,
-                sample.visibility,
-                sample.image.shape[0],
-                config.min_height,
-                config.min_visibility,
-            ),
-        )
-        for sample in held_out
-    ]
-    found = [detect_with_torch(model, network, sample.image, 0.01) for sample in held_out]
-    return Evaluation({int(c): class_figures(found, truth, int(c), OPERATING_SCORE) for c in table})
-
-
-def endless_samples(folder: Path, seed: int, reread_every: int = 400) -> Iterator[LabelledImage]:
-    """Images of a folder in random order, rare classes more often; new files are taken up as they appear.
-
-    Args:
-        folder: Sample folder.
-        seed: Of the random order.
-        reread_every: Images after which the label file is read again.
-
-    Raises:
-        ModelError: the folder holds no samples.
-    """
-    rng = np.random.default_rng(seed)
-    while True:
-        entries = read_entries(folder)
-        if not entries:
-            raise ModelError(f"{folder} holds no samples; render a training set into it first")
-        weights = sampling_weights(entries)
-        for index in rng.choice(len(entries), reread_every, p=weights):
-            yield entries[int(index)].load()
-
-
-def sampling_weights(entries: Sequence[SampleEntry]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Probability of each image: by its rarest class, square root of the inverse frequency, float64 [N]."""
-    holds: dict[int, int] = {}
-    for entry in entries:
-        for index in set(entry.class_ids.tolist()):
-            holds[index] = holds.get(index, 0) + 1
-    rarity = {index: (len(entries) / count) ** 0.5 for index, count in holds.items()}
-    rarest = [max((rarity[i] for i in entry.class_ids.tolist()), default=0.5) for entry in entries]
-    weights = np.array(rarest)
-    return np.asarray(weights / weights.sum(), np.float64)
+def recipe_text(network: CompactRtDetrConfig, config: TrainConfig) -> str:
+    """What a state must have in common with the training that continues it; its length may change."""
+    settings = asdict(config)
+    for free in ("minutes", "steps", "checkpoint_minutes"):
+        del settings[free]
+    return json.dumps({"network": asdict(network), **settings})
 
 
 def load_weights(network: CompactRtDetrConfig, checkpoint: Path) -> RTDetrForObjectDetection:
@@ -298,26 +280,3 @@ def load_weights(network: CompactRtDetrConfig, checkpoint: Path) -> RTDetrForObj
     except (OSError, RuntimeError) as error:
         raise ModelError(f"{checkpoint} holds no weights for {network}: {error}") from error
     return model.train(False)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """``python -m cable_models.training.train_rtdetr TRAIN_DIR HELD_OUT_DIR CHECKPOINT``."""
-    parser = argparse.ArgumentParser(description="Train the compact RT-DETR on folders of labelled images.")
-    parser.add_argument("train_folder", type=Path)
-    parser.add_argument("held_out_folder", type=Path)
-    parser.add_argument("checkpoint", type=Path, help="safetensors file to write")
-    parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    torch.set_num_threads(options.threads)
-    cv2.setNumThreads(1)
-    config = replace(TrainConfig(), minutes=options.minutes, seed=options.seed)
-    held_out = [entry.load() for entry in read_entries(options.held_out_folder)]
-    samples = endless_samples(options.train_folder, options.seed)
-    train(samples, held_out, CompactRtDetrConfig(), config, options.checkpoint)
-
-
-if __name__ == "__main__":
-    main()
