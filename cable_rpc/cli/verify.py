@@ -273,9 +273,9 @@ def print_verification(console: Console, found: Verification, model: str) -> Non
     options = recommended_options(found)
     console.print(
         f"[bold green]recommended: {best.variant.name}[/] (J {best.to_region.region:.3f} >= {found.wanted:.2f}, "
-        f"{published / best.wall_ms:.1f}x as fast as the published inference)\n"
-        f"  cable-rpc serve --segmenter 'lisa:{model}?{options}'"
+        f"{published / best.wall_ms:.1f}x as fast as the published inference)"
     )
+    console.print(f"  cable-rpc serve --segmenter 'lisa:{model}?{options}'", soft_wrap=True)
 
 
 def recommended_options(found: Verification) -> str:

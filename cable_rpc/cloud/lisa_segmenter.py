@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from cable_models.embedded import embedded_segmenter_path
 from cable_models.errors import ModelError as LisaError
 
 from cable_rpc.cloud.backends import BackendOptions, FrameContext
@@ -195,6 +196,22 @@ def warm_up(segmenter: LisaSegmenter) -> None:
     for roi in (whole, whole, whole, part):
         segmenter.segment(image, roi, DEFAULT_PROMPT, FrameContext(0, Detections.empty(), WARM_UP_STREAM))
     segmenter.forget_stream(WARM_UP_STREAM)
+
+
+def load_embedded(argument: str, options: BackendOptions) -> LisaSegmenter:
+    """Entry point ``embedded[?key=value&...]``: the compact LISA trained on the rendered world.
+
+    Raises:
+        ConfigurationError: an option can't be used, or torch is missing.
+        ModelError: it is not part of this installation.
+    """
+    if argument and not argument.startswith("?"):
+        raise ConfigurationError(f"the embedded segmenter takes options only, as embedded?key=value, got '{argument}'")
+    try:
+        folder = embedded_segmenter_path()
+    except LisaError as error:
+        raise ModelError(str(error)) from error
+    return load_lisa(f"{folder}{argument}", options)
 
 
 def torch_device(wanted: str) -> str:
