@@ -84,10 +84,11 @@ def segmenter(
 
 def render_sets(work: Path, frames: int, held_out: int, console: Console) -> None:
     """Renders what is missing of both sets."""
-    from cable_rpc.study.train_segmenter import HELD_OUT_PLAN, TRAINING_PLAN, render_segmented
+    from cable_rpc.study.rendered_frames import render_into
+    from cable_rpc.study.train_segmenter import HELD_OUT_PLAN, TRAINING_PLAN, write_segmented
 
     for name, plan, count in (("held_out", HELD_OUT_PLAN, held_out), ("train", TRAINING_PLAN, frames)):
-        rendering = render_segmented(work / name, plan, count)
+        rendering = render_into(work / name, plan, count, write_segmented)
         for _ in track(rendering, f"rendering {name}", total=count, console=console):
             pass
 

@@ -155,12 +155,11 @@ def load(model: str, clip: str | None, revision: str | None, device: str, dtype:
     import torch
     from cable_models.lisa import load_lisa
 
-    from cable_rpc.cloud.lisa_segmenter import torch_device
+    from cable_rpc.cloud.lisa_segmenter import number_formats, torch_device
 
     torch.set_num_threads(threads)
     place = torch_device(device)
-    formats = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
-    formats["auto"] = torch.float32 if place == "cpu" else torch.bfloat16
+    formats = number_formats(place)
     if dtype not in formats:
         raise ConfigurationError(f"--dtype is '{dtype}'; use {', '.join(formats)}")
     return load_lisa(model, clip=clip, revision=revision, device=place, dtype=formats[dtype])

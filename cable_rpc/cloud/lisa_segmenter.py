@@ -26,6 +26,7 @@ MAX_PROMPT_CHARACTERS = 2000
 """Longest question taken from a client: the memory that a prompt takes grows with its length."""
 
 if TYPE_CHECKING:
+    import torch
     from cable_models.lisa.loader import LoadedLisa
     from cable_models.lisa.pipeline import FrameAnswer, LisaPipeline
 
@@ -151,8 +152,7 @@ def load_lisa(argument: str, options: BackendOptions) -> LisaSegmenter:
     source_settings, settings = read_options(spec, query, LisaSource, LisaOptions)
     source = LisaSource(**source_settings)
     device = torch_device(options.device)
-    formats = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
-    formats["auto"] = torch.float32 if device == "cpu" else torch.bfloat16
+    formats = number_formats(device)
     if device == "cpu":
         torch.set_num_threads(options.threads)
     try:
@@ -174,7 +174,8 @@ def load_lisa(argument: str, options: BackendOptions) -> LisaSegmenter:
         raise ModelError(str(error)) from error
     except torch.OutOfMemoryError as error:
         raise ModelError(
-            f"{checkpoint} does not fit into the memory of {device}; a 7B checkpoint needs about 17 GB in bf16"
+            f"{checkpoint} does not fit into the memory of {device}; "
+            "the weights alone of a 7B checkpoint take 15.5 GB in bf16"
         ) from error
     name = loaded.folder.resolve().name if Path(checkpoint).expanduser().is_dir() else checkpoint
     segmenter = LisaSegmenter(pipeline, name=f"lisa:{name}", revision=weights_revision(loaded.folder))
@@ -231,6 +232,14 @@ def torch_device(wanted: str) -> str:
     if wanted not in ("cpu", "cuda"):
         raise ConfigurationError(f"device '{wanted}' is unknown; use auto, cpu or cuda")
     return wanted
+
+
+def number_formats(device: str) -> dict[str, torch.dtype]:
+    """Formats of the weights by the names that users give; ``auto`` is what the device is fast in."""
+    import torch
+
+    formats = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
+    return formats | {"auto": torch.float32 if device == "cpu" else torch.bfloat16}
 
 
 def require_tokenizer(loaded: LoadedLisa, checkpoint: str) -> None:

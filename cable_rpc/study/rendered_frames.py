@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -59,16 +59,27 @@ TRAINING_PLAN = RenderPlan(TRAINING_SEEDS, frames_per_seed=8, width=512, height=
 HELD_OUT_PLAN = RenderPlan(HELD_OUT_SEEDS, frames_per_seed=2, width=640, height=360, vary=False)
 
 
-def render_into(folder: Path, plan: RenderPlan, frames: int) -> Iterator[str]:
+SampleWriter = Callable[[Path, str, Frame], None]
+"""Writes a rendered frame into a sample folder, under a name, the picture as ``NAME.jpg``."""
+
+
+def write_boxes(folder: Path, name: str, frame: Frame) -> None:
+    """Writes a rendered frame as a sample of a detector's training.
+
+    Raises:
+        SourceError: the frame has no truth.
+    """
+    append_sample(folder, name, labelled(frame))
+
+
+def render_into(folder: Path, plan: RenderPlan, frames: int, write: SampleWriter = write_boxes) -> Iterator[str]:
     """Renders what is missing of a plan's first frames into a sample folder, and yields the name of each frame.
 
     Args:
         folder: Sample folder, made where it is missing.
         plan: Which frames.
         frames: How many of them in all, those already there included.
-
-    Raises:
-        SourceError: a frame came without its truth.
+        write: Writes a frame; its errors pass through.
     """
     folder.mkdir(parents=True, exist_ok=True)
     left = frames
@@ -78,7 +89,7 @@ def render_into(folder: Path, plan: RenderPlan, frames: int) -> Iterator[str]:
         for index, name in names.items():
             if not (folder / f"{name}.jpg").is_file():
                 source = source or SyntheticSource(plan.world(seed))
-                append_sample(folder, name, labelled(source.frame(index)))
+                write(folder, name, source.frame(index))
             yield name
         left -= len(names)
         if left <= 0:

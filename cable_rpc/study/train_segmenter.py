@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from cable_models.training.segmentation_samples import SegmentedImage, append_se
 from cable_models.training.segmentation_stages import TIME_SHARES, SegmenterTraining, Stage, run_stage
 from cable_models.training.segmentation_trainer import StageConfig, StageProgress
 
-from cable_rpc.data.synthetic import SyntheticSource
 from cable_rpc.errors import SourceError
 from cable_rpc.study.rendered_frames import HELD_OUT_SEEDS, RenderPlan, labelled
 from cable_rpc.types import Frame
@@ -40,34 +39,8 @@ class SegmenterFigures:
     """With all but a region around the true objects blacked out, as an edge sends it."""
 
 
-def render_segmented(folder: Path, plan: RenderPlan, frames: int) -> Iterator[str]:
-    """Renders what is missing of a plan's first frames, instance masks included, and yields the name of each frame.
-
-    Args:
-        folder: Sample folder, made where it is missing.
-        plan: Which frames.
-        frames: How many of them in all, those already there included.
-
-    Raises:
-        SourceError: a frame came without its instance mask.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    left = frames
-    for seed in plan.seeds:
-        names = {index: f"{seed:06d}_{index:03d}" for index in plan.frame_indices(seed)[:left]}
-        source: SyntheticSource | None = None
-        for index, name in names.items():
-            if not (folder / f"{name}.jpg").is_file():
-                source = source or SyntheticSource(plan.world(seed))
-                write_frame(folder, name, source.frame(index))
-            yield name
-        left -= len(names)
-        if left <= 0:
-            return
-
-
-def write_frame(folder: Path, name: str, frame: Frame) -> None:
-    """Writes a rendered frame as a training sample.
+def write_segmented(folder: Path, name: str, frame: Frame) -> None:
+    """Writes a rendered frame as a sample of a segmenter's training; a writer for `render_into`.
 
     Raises:
         SourceError: the frame has no instance mask.
