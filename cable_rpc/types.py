@@ -119,6 +119,9 @@ class GroundTruth:
     """float32 [N], visible share of the object's projected area, 0..1 (1 where the data set has no flag)."""
     instance_mask: npt.NDArray[np.int32] | None = None
     """int32 [height, width], row number + 1 of the object seen at each pixel, 0 = none of them."""
+    ignored_boxes_xyxy: Float32Array | None = None
+    """float32 [M, 4], regions that nobody annotated (KITTI's DontCare, COCO's crowds); a detection in one of them
+    is neither right nor wrong."""
 
     def __len__(self) -> int:
         return len(self.class_ids)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import parse_qsl
 
+from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.types import CameraIntrinsics, CameraMount, Frame
 
@@ -53,6 +54,8 @@ class SourceOptions:
     intrinsics: CameraIntrinsics | None = None
     fps: float | None = None
     mount: CameraMount | None = None
+    bad_frames: BadFrames = field(default_factory=BadFrames)
+    """What becomes of damaged frames and label rows of a data set."""
 
     def __post_init__(self) -> None:
         if self.max_frames is not None and self.max_frames < 1:
