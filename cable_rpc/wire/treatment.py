@@ -22,6 +22,10 @@ CROPS: dict[str, pb.CropMode] = {
     "rows": pb.CROP_MODE_ROWS,
     "box": pb.CROP_MODE_BOX,
 }
+REFILLS: dict[str, pb.BackgroundRefill] = {
+    "constant": pb.BACKGROUND_REFILL_UNSPECIFIED,
+    "diffuse": pb.BACKGROUND_REFILL_DIFFUSE,
+}
 INTERPOLATIONS: dict[str, pb.Interpolation] = {
     "cubic": pb.INTERPOLATION_CUBIC,
     "linear": pb.INTERPOLATION_LINEAR,
@@ -40,6 +44,7 @@ def treatment_to_message(treatment: RegionTreatment) -> pb.RegionTreatment:
         interpolation=INTERPOLATIONS[treatment.interpolation],
         feather_px=treatment.feather_px,
         compose=treatment.compose,
+        refill=REFILLS[treatment.refill],
     )
 
 
@@ -57,6 +62,7 @@ def treatment_from_message(message: pb.RegionTreatment) -> RegionTreatment:
         "interpolation": name_of(message.interpolation or pb.INTERPOLATION_CUBIC, INTERPOLATIONS, "interpolation"),
         "feather_px": message.feather_px,
         "compose": message.compose,
+        "refill": name_of(message.refill, REFILLS, "refill"),
     }
     try:
         return RegionTreatment(**fields)

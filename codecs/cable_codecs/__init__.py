@@ -6,6 +6,7 @@ Images are uint8 [height, width, 3] in BGR order; masks are bool [height, width]
 from cable_codecs.base import CodecParameters, Decoder, EncodedFrame, Encoder
 from cable_codecs.compose import BackgroundComposer
 from cable_codecs.crop import CropBox
+from cable_codecs.diffuse import diffuse_background
 from cable_codecs.errors import CodecError, CodecUnavailableError
 from cable_codecs.fill import FillMode, fill_background, fill_blocks
 from cable_codecs.h264 import DEFAULT_CRF
@@ -20,7 +21,7 @@ from cable_codecs.registry import STILL_CODECS, available_codecs, create_decoder
 from cable_codecs.sized_codecs import SizedDecoder, SizedEncoder
 from cable_codecs.still import DEFAULT_QUALITY
 from cable_codecs.treated_codec import TreatedDecoder, TreatedEncoder, TreatedPacket
-from cable_codecs.treatment import RegionTreatment
+from cable_codecs.treatment import RefillMode, RegionTreatment
 
 __all__ = [
     "DEFAULT_CRF",
@@ -39,6 +40,7 @@ __all__ = [
     "Encoder",
     "FillMode",
     "QualityCurve",
+    "RefillMode",
     "RegionReceiver",
     "RegionSender",
     "RegionTreatment",
@@ -56,6 +58,7 @@ __all__ = [
     "create_encoder",
     "decode_mask",
     "default_quality",
+    "diffuse_background",
     "encode_mask",
     "fill_background",
     "fill_blocks",

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from cable_codecs.base import BoolMask, Image
 from cable_codecs.compose import BackgroundComposer, ComposedFrame
 from cable_codecs.crop import CropBox, uncrop
+from cable_codecs.diffuse import diffuse_background
 from cable_codecs.errors import CodecError
 from cable_codecs.fill import GREY, background_colour, copy_kept, paint
 from cable_codecs.region_grid import check_blocks, grow_to_grid, region_pixels
@@ -81,7 +82,8 @@ class RegionReceiver:
         colour = np.zeros(3, np.uint8) if blocks is None else self.fill_colour(picture, blocks, block_size, box)
         roi = None if blocks is None else region_pixels(blocks, block_size, *geometry.size)
         refill = roi is not None and self.treatment.refills and self.composer is None
-        if box is not None and (self.treatment.scale < 1 or not refill):
+        diffuse = refill and self.treatment.refill == "diffuse"
+        if box is not None and (self.treatment.scale < 1 or not refill or diffuse):
             picture, box = uncrop(picture, box, *geometry.uploaded, colour), None
         if self.treatment.scale < 1:
             picture = enlarge_image(picture, geometry.size, self.treatment.interpolation)
@@ -92,6 +94,8 @@ class RegionReceiver:
             return RestoredFrame(composed.image, roi, composed)
         if roi is None or not refill:
             return RestoredFrame(picture, roi, None)
+        if diffuse:
+            return RestoredFrame(diffuse_background(picture, roi), roi, None)
         image = np.empty((*geometry.size, 3), np.uint8)
         paint(image, colour)
         # A crop that is to be refilled anyway goes straight to its place.

@@ -2,13 +2,14 @@
 
 The sender, in this order: grow the region to the grid; hold blocks that just left it; lower the resolution; fill the
 background; feather the edge; crop. The receiver, from the decoded picture and the region that travelled with it:
-put the crop back in place; enlarge; fill the background again, since lossy coding smears it; compose.
+put the crop back in place; enlarge; fill the background again, since lossy coding smears it and models take its edges
+for objects; compose.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self, get_args
 
 from cable_codecs.base import BoolMask
 from cable_codecs.crop import CropBox, CropMode, check_crop_mode, crop_box
@@ -25,6 +26,10 @@ from cable_codecs.upload_scale import (
 )
 
 LARGEST_GRID = 64
+
+RefillMode = Literal["constant", "diffuse"]
+"""What the receiver puts outside the region. ``constant``: the colour that the fill stands for, black for most.
+``diffuse``: the region's own colours, spread outward (`cable_codecs.diffuse_background`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,8 @@ class RegionTreatment:
     """Sides of the picture sent, as a share of the camera's, 1/16..1."""
     interpolation: Interpolation = "cubic"
     """How the receiver enlarges."""
+    refill: RefillMode = "constant"
+    """What the receiver puts there before the models look; nothing where the fill is ``keep`` or it composes."""
     compose: bool = False
     """Whether the receiver puts the last background back."""
     quantiser_offset: float = 0.0
@@ -59,6 +66,8 @@ class RegionTreatment:
 
     def __post_init__(self) -> None:
         check_fill_mode(self.fill)
+        if self.refill not in get_args(RefillMode):
+            raise CodecError(f"unknown refill {self.refill!r}; choose one of {', '.join(get_args(RefillMode))}")
         if not 1 <= self.grid <= LARGEST_GRID:
             raise CodecError(f"the region's grid must be 1..{LARGEST_GRID} pixels, got {self.grid}")
         check_hysteresis(self.hold_frames, self.hold_most_share)
@@ -75,8 +84,9 @@ class RegionTreatment:
 
     @classmethod
     def default_for(cls, *, stateless: bool) -> Self:
-        """What measured best: a frozen background for video, rows cropped to the region for image codecs."""
-        return cls(crop="rows") if stateless else cls(fill="freeze")
+        """What measured best: a frozen background for video, rows cropped to the region for image codecs; and for the
+        models the region's own colours around it."""
+        return cls(crop="rows", refill="diffuse") if stateless else cls(fill="freeze", refill="diffuse")
 
     @property
     def refills(self) -> bool:

@@ -16,6 +16,7 @@ from cable_models.training.detector_evaluation import Counted, judge_all
 from cable_models.training.labelled_clips import read_clip
 from cable_models.training.samples import LabelledImage, append_sample, learnable, read_entries
 from cable_models.training.sampling import BalancedSampler
+from cable_models.training.upload_views import WeightedFill, corridor_blocks, grey, upload_region
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -143,7 +144,7 @@ def test_rare_classes_are_drawn_as_often_as_asked(frames: Path) -> None:
 def test_batches_have_the_sizes_of_their_views(frames: Path) -> None:
     sampler, rng = BalancedSampler(frames), np.random.default_rng(0)
     seen = set()
-    for _ in range(8):
+    for _ in range(20):
         batch = next_batch(sampler, TINY, 2, 5.0, 0.25, rng)
         images, _, height, width = batch.pixels.shape
         seen.add((images, width, height))
@@ -271,7 +272,7 @@ def test_small_and_hidden_objects_are_not_taught() -> None:
 
 def test_augmented_boxes_still_frame_their_object() -> None:
     rng = np.random.default_rng(7)
-    config = AugmentConfig(colour=0, blacken=0, jpeg=0, crop=1.0)
+    config = AugmentConfig(colour=0, region_only=0, jpeg=0, crop=1.0)
     checked = 0
     for turn in range(40):
         changed = augment(squares(rng), (128, 80), config, rng, focus=0 if turn % 2 else None)
@@ -286,9 +287,9 @@ def test_augmented_boxes_still_frame_their_object() -> None:
     assert checked > 20
 
 
-def test_blackened_images_keep_only_what_is_left_to_see() -> None:
+def test_masked_images_keep_only_what_is_left_to_see() -> None:
     rng = np.random.default_rng(5)
-    config = AugmentConfig(flip=0, crop=0, colour=0, blacken=1.0, jpeg=0)
+    config = AugmentConfig(flip=0, crop=0, colour=0, region_only=1.0, jpeg=0)
     filled = 0
     for _ in range(30):
         changed = augment(squares(rng), (160, 96), config, rng)
@@ -376,3 +377,45 @@ def test_labels_of_photographed_clips_are_read(tmp_path: Path) -> None:
         read_clip("cityscapes:somewhere")
     with pytest.raises(ModelError, match="holds no labelled frames"):
         read_clip(f"camvid:{images}")
+
+
+def test_a_corridor_links_what_is_far_apart_with_the_methods_margins() -> None:
+    blocks = np.zeros((90, 200), np.bool_)
+    blocks[38:43, 20:25] = True
+    blocks[30:35, 100:105] = True
+    band = corridor_blocks(blocks)
+    assert band[blocks].all()
+    columns = np.flatnonzero(band.any(axis=0))
+    assert (columns == np.arange(20, 105)).all()
+    # 10 % of the way to the top, 15 % of the way to the bottom, and whole blocks
+    assert np.flatnonzero(band[:, 22])[[0, -1]].tolist() == [34, 50]
+    assert np.flatnonzero(band[:, 102])[[0, -1]].tolist() == [27, 43]
+    middle = np.flatnonzero(band[:, 62])
+    assert 27 <= middle[0] <= 34
+    assert 43 <= middle[-1] <= 50
+
+
+def test_upload_regions_are_blocks_that_hold_most_objects_whole() -> None:
+    rng = np.random.default_rng(2)
+    boxes = np.array([[20, 30, 60, 70], [100, 40, 130, 90]], np.float32)
+    whole = 0
+    for _ in range(60):
+        region = upload_region(boxes, (96, 160), rng)
+        padded = np.pad(region, ((0, -96 % 8), (0, -160 % 8)))
+        per_block = padded.reshape(padded.shape[0] // 8, 8, padded.shape[1] // 8, 8).mean(axis=(1, 3))
+        assert set(np.unique(per_block)) <= {0.0, 1.0}
+        shares = covered_share(boxes, region)
+        whole += int((shares == 1).sum())
+    assert whole >= 0.85 * 120
+    assert not upload_region(np.zeros((0, 4), np.float32), (96, 160), rng).any()
+
+
+def test_the_drawn_fill_is_what_stands_outside() -> None:
+    rng = np.random.default_rng(4)
+    config = AugmentConfig(flip=0, crop=0, colour=0, region_only=1.0, jpeg=0)
+    marks = [WeightedFill(lambda image, region: np.where(region[..., None], image, np.uint8(7)), 1.0)]
+    marks.append(WeightedFill(grey, 0.0))
+    for _ in range(10):
+        changed = augment(squares(rng), (160, 96), config, rng, fills=marks)
+        assert (changed.image == 7).all(axis=2).any()
+        assert not (changed.image == 128).all(axis=2).any()

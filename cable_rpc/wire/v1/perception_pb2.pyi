@@ -34,6 +34,11 @@ class BackgroundFill(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     BACKGROUND_FILL_FREEZE: _ClassVar[BackgroundFill]
     BACKGROUND_FILL_KEEP: _ClassVar[BackgroundFill]
 
+class BackgroundRefill(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    BACKGROUND_REFILL_UNSPECIFIED: _ClassVar[BackgroundRefill]
+    BACKGROUND_REFILL_DIFFUSE: _ClassVar[BackgroundRefill]
+
 class CropMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     CROP_MODE_UNSPECIFIED: _ClassVar[CropMode]
@@ -82,6 +87,8 @@ BACKGROUND_FILL_MEAN: BackgroundFill
 BACKGROUND_FILL_BLUR: BackgroundFill
 BACKGROUND_FILL_FREEZE: BackgroundFill
 BACKGROUND_FILL_KEEP: BackgroundFill
+BACKGROUND_REFILL_UNSPECIFIED: BackgroundRefill
+BACKGROUND_REFILL_DIFFUSE: BackgroundRefill
 CROP_MODE_UNSPECIFIED: CropMode
 CROP_MODE_ROWS: CropMode
 CROP_MODE_BOX: CropMode
@@ -219,7 +226,7 @@ class CodecConfig(_message.Message):
     def __init__(self, codec: _Optional[_Union[Codec, str]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., frame_rate: _Optional[float] = ..., quality: _Optional[int] = ..., treatment: _Optional[_Union[RegionTreatment, _Mapping]] = ...) -> None: ...
 
 class RegionTreatment(_message.Message):
-    __slots__ = ("fill", "grid", "crop", "scale", "interpolation", "feather_px", "compose")
+    __slots__ = ("fill", "grid", "crop", "scale", "interpolation", "feather_px", "compose", "refill")
     FILL_FIELD_NUMBER: _ClassVar[int]
     GRID_FIELD_NUMBER: _ClassVar[int]
     CROP_FIELD_NUMBER: _ClassVar[int]
@@ -227,6 +234,7 @@ class RegionTreatment(_message.Message):
     INTERPOLATION_FIELD_NUMBER: _ClassVar[int]
     FEATHER_PX_FIELD_NUMBER: _ClassVar[int]
     COMPOSE_FIELD_NUMBER: _ClassVar[int]
+    REFILL_FIELD_NUMBER: _ClassVar[int]
     fill: BackgroundFill
     grid: int
     crop: CropMode
@@ -234,7 +242,8 @@ class RegionTreatment(_message.Message):
     interpolation: Interpolation
     feather_px: int
     compose: bool
-    def __init__(self, fill: _Optional[_Union[BackgroundFill, str]] = ..., grid: _Optional[int] = ..., crop: _Optional[_Union[CropMode, str]] = ..., scale: _Optional[float] = ..., interpolation: _Optional[_Union[Interpolation, str]] = ..., feather_px: _Optional[int] = ..., compose: bool = ...) -> None: ...
+    refill: BackgroundRefill
+    def __init__(self, fill: _Optional[_Union[BackgroundFill, str]] = ..., grid: _Optional[int] = ..., crop: _Optional[_Union[CropMode, str]] = ..., scale: _Optional[float] = ..., interpolation: _Optional[_Union[Interpolation, str]] = ..., feather_px: _Optional[int] = ..., compose: bool = ..., refill: _Optional[_Union[BackgroundRefill, str]] = ...) -> None: ...
 
 class TaskConfig(_message.Message):
     __slots__ = ("prompt", "min_score")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 
 from cable_models.detection import Float32Array, Image
 from cable_models.training.samples import LabelledImage
+from cable_models.training.upload_views import CONSTANT_FILLS, RegionFill, WeightedFill, draw_fill, upload_region
 
 MIN_KEPT_AREA = 0.4
 
@@ -23,7 +25,7 @@ class AugmentConfig:
     crop_shares: tuple[float, float] = (0.55, 1.0)
     """Smallest and largest crop as a share of the image's width and height."""
     colour: float = 0.8
-    blacken: float = 0.35
+    region_only: float = 0.5
     """Share of images of which only a region around the objects is kept, as an edge uploads them."""
     jpeg: float = 0.4
 
@@ -34,6 +36,7 @@ def augment(
     config: AugmentConfig,
     rng: np.random.Generator,
     focus: int | None = None,
+    fills: Sequence[WeightedFill] = CONSTANT_FILLS,
 ) -> LabelledImage:
     """A changed copy, resized to ``size_wh`` pixels; objects mostly lost to a crop or a fill are dropped.
 
@@ -43,6 +46,7 @@ def augment(
         config: How often and how strongly.
         rng: Source of all draws.
         focus: Row of an object that a crop keeps, whole where the crop is large enough.
+        fills: What may stand outside a kept region.
     """
     sample = random_crop(sample, size_wh, config, rng, focus)
     if rng.random() < config.flip:
@@ -51,8 +55,8 @@ def augment(
     if rng.random() < config.colour:
         image = jitter_colour(image, rng)
     sample = LabelledImage(image, sample.boxes_xyxy, sample.class_ids, sample.visibility)
-    if rng.random() < config.blacken:
-        sample = keep_region(sample, rng)
+    if rng.random() < config.region_only:
+        sample = keep_region(sample, draw_fill(fills, rng), rng)
     if rng.random() < config.jpeg:
         recoded = jpeg_recoded(sample.image, int(rng.integers(20, 90)))
         sample = LabelledImage(recoded, sample.boxes_xyxy, sample.class_ids, sample.visibility)
@@ -115,31 +119,13 @@ def jitter_colour(image: Image, rng: np.random.Generator) -> Image:
     return np.asarray(cv2.addWeighted(toned, saturation, grey, 1 - saturation, 0), np.uint8)
 
 
-def keep_region(sample: LabelledImage, rng: np.random.Generator) -> LabelledImage:
-    """Fills all but a region around some of the objects, on an 8x8 grid, as the upload of an edge looks."""
-    height, width = sample.image.shape[:2]
-    rows, columns = -(-height // 8), -(-width // 8)
-    region = np.zeros((rows, columns), np.bool_)
-    margin = rng.uniform(2, 40)
-    seen = rng.random(len(sample.boxes_xyxy)) < 0.92
-    for x0, y0, x1, y1 in grown_blocks(sample.boxes_xyxy[seen], margin):
-        region[y0:y1, x0:x1] = True
-    if rng.random() < 0.5 and region.any():
-        occupied = np.flatnonzero(region.any(axis=1))
-        region[occupied[0] : occupied[-1] + 1] |= region.any(axis=0) | (rng.random() < 0.5)
-    pixels = region.repeat(8, axis=0).repeat(8, axis=1)[:height, :width]
-    fill = (0, 128, int(sample.image.mean()))[int(rng.choice(3, p=[0.6, 0.25, 0.15]))]
-    image = np.where(pixels[..., None], sample.image, np.uint8(fill))
-    kept = covered_share(sample.boxes_xyxy, pixels) >= MIN_KEPT_AREA
-    return LabelledImage(image, sample.boxes_xyxy[kept], sample.class_ids[kept], sample.visibility[kept])
-
-
-def grown_blocks(boxes_xyxy: Float32Array, margin: float) -> list[list[int]]:
-    """Boxes grown by ``margin`` pixels, in whole 8x8 blocks, as x0, y0, x1, y1."""
-    low = np.maximum(np.floor((boxes_xyxy[:, :2] - margin) / 8), 0)
-    high = np.ceil((boxes_xyxy[:, 2:] + margin) / 8)
-    blocks: list[list[int]] = np.concatenate([low, high], axis=1).astype(int).tolist()
-    return blocks
+def keep_region(sample: LabelledImage, fill: RegionFill, rng: np.random.Generator) -> LabelledImage:
+    """Replaces all but a region around most of the objects, as the upload of an edge looks."""
+    region = upload_region(sample.boxes_xyxy, sample.image.shape[:2], rng)
+    kept = covered_share(sample.boxes_xyxy, region) >= MIN_KEPT_AREA
+    return LabelledImage(
+        fill(sample.image, region), sample.boxes_xyxy[kept], sample.class_ids[kept], sample.visibility[kept]
+    )
 
 
 def covered_share(boxes_xyxy: Float32Array, pixels: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Float32Array:

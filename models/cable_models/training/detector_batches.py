@@ -14,6 +14,7 @@ from cable_models.rtdetr.preprocess import fill_input
 from cable_models.training.augment import AugmentConfig, augment
 from cable_models.training.samples import LabelledImage, learnable
 from cable_models.training.sampling import BalancedSampler
+from cable_models.training.upload_views import CONSTANT_FILLS, WeightedFill
 
 STRIDE = 32
 """Sides of every view are multiples of the coarsest stride."""
@@ -67,6 +68,7 @@ def next_batch(
     min_visibility: float,
     rng: np.random.Generator,
     views: Sequence[View] = VIEWS,
+    fills: Sequence[WeightedFill] = CONSTANT_FILLS,
 ) -> Batch:
     """Draws a view and fills it.
 
@@ -78,6 +80,7 @@ def next_batch(
         min_visibility: Smallest visible share of an object taught.
         rng: Source of all draws.
         views: Ways of showing images.
+        fills: What may stand outside a kept region.
     """
     weights = np.array([view.weight for view in views])
     view = views[int(rng.choice(len(views), p=weights / weights.sum()))]
@@ -85,7 +88,7 @@ def next_batch(
     changed = []
     for _ in range(max(1, round(view.images * images))):
         focus = sampler.draw(rng)
-        changed.append(augment(focus.sample, size_wh, view.augment, rng, focus.row))
+        changed.append(augment(focus.sample, size_wh, view.augment, rng, focus.row, fills))
     tensor = np.empty((len(changed), 3, size_wh[1], size_wh[0]), np.float32)
     fill_input([sample.image for sample in changed], tensor)
     targets = [target_of(sample, network.labels, size_wh, min_height_px, min_visibility) for sample in changed]

@@ -29,6 +29,7 @@ from cable_models.training.detector_evaluation import LOWEST_SCORE, Evaluation, 
 from cable_models.training.detector_state import Progress, load_state, save_state
 from cable_models.training.samples import LabelledImage
 from cable_models.training.sampling import BalancedSampler
+from cable_models.training.upload_views import CONSTANT_FILLS, WeightedFill
 
 log = logging.getLogger(__name__)
 
@@ -103,6 +104,7 @@ def train(
     *,
     device: str = "cpu",
     initial: Path | None = None,
+    fills: Sequence[WeightedFill] = CONSTANT_FILLS,
     listener: Callable[[StepReport], None] = lambda _: None,
     should_stop: Callable[[], bool] = lambda: False,
     clock: Callable[[], float] = time.monotonic,
@@ -117,6 +119,7 @@ def train(
         files: Weights and state to write; an existing state is continued.
         device: torch device.
         initial: Weights to start from instead of random ones; ignored where a state is continued.
+        fills: What may stand outside the region in masked images.
         listener: Called after each step.
         should_stop: Asked before each step; a stop leaves a state to continue from.
         clock: Seconds, monotonic.
@@ -140,7 +143,9 @@ def train(
     while share_gone(config, progress) < 1 and not should_stop():
         gone = share_gone(config, progress)
         set_learning_rate(trainee.optimiser, learning_rate(config, progress.step, gone))
-        batch = next_batch(sampler, network, config.batch, config.min_height_px, config.min_visibility, rng)
+        batch = next_batch(
+            sampler, network, config.batch, config.min_height_px, config.min_visibility, rng, fills=fills
+        )
         loss = train_step(trainee, batch, config, device)
         progress.step += 1
         update_average(
