@@ -30,9 +30,9 @@ def demo(
     """Stream a rendered driving clip edge -> codec -> gRPC -> models -> mask -> edge, and show what it cost."""
     console.print(
         f"[bold]CABLE-RPC demo[/bold]: a rendered drive (synthetic:{seed}, {frames} frames), a server and an edge "
-        "client as two processes over loopback. The models are the compact ones that ship with the package."
+        "client as two processes over loopback. The models are the compact RT-DETR and LISA that ship with the package."
     )
-    with local_server(["--detector", "embedded", "--segmenter", "boxes"]) as target:
+    with local_server(["--detector", "embedded", "--segmenter", "embedded"]) as target:
         console.print(f"server ready on {target}")
         config = StreamRunConfig(target=target, out=out, codec=codec, command_line="cable-rpc demo")
         run_and_report(open_source(f"synthetic:{seed}", max_frames=frames), config)

@@ -25,11 +25,12 @@ def serve(
     segmenter: Annotated[
         str,
         typer.Option(
-            help="boxes (the detector's boxes, filled) | lisa:FOLDER_OR_HUB_ID (LISA++, e.g. Senqiao/LISA_Plus_7b; "
-            "options follow as ?key=value&key=value, in quotes, and lisa alone lists them) | crop:SEGMENTER (any "
-            "other one, shown only the box around the region) | oracle:SOURCE (ground truth, evaluation only)."
+            help="embedded (compact LISA, rendered world) | lisa:FOLDER_OR_HUB_ID (LISA++, e.g. Senqiao/LISA_Plus_7b; "
+            "options follow as ?key=value&key=value, in quotes, and lisa alone lists them) | boxes (the detector's "
+            "boxes, filled) | crop:SEGMENTER (any other one, shown only the box around the region) | oracle:SOURCE "
+            "(ground truth, evaluation only)."
         ),
-    ] = "boxes",
+    ] = "embedded",
     device: Annotated[str, typer.Option(help="auto | cpu | cuda.")] = "auto",
     threads: Annotated[int, typer.Option(help="CPU threads of each model.", min=1)] = 1,
     min_score: Annotated[float, typer.Option(help="Detections below are dropped.", min=0.0, max=1.0)] = 0.4,
