@@ -67,11 +67,12 @@ def segmenter(
     from cable_models.training.segmentation_stages import STAGES, SegmenterTraining
     from cable_models.training.segmentation_trainer import StageConfig
 
+    from cable_rpc.study.region_fills import FILLS
     from cable_rpc.study.train_segmenter import CHECKPOINT_FOLDER
 
     console = Console()
     wanted = set(stages or SegmenterStage)
-    training = SegmenterTraining(work, batch=batch, seed=seed)
+    training = SegmenterTraining(work, batch=batch, fills=FILLS, seed=seed)
     if SegmenterStage.RENDER in wanted:
         render_sets(work, frames, held_out, console)
     learnt = [stage for stage in STAGES if SegmenterStage(stage) in wanted]

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cable_codecs import diffuse_background
 from cable_models.embedded import EMBEDDED_DETECTOR
 from cable_models.rtdetr.compact import CompactRtDetrConfig, for_inference
 from cable_models.rtdetr.export import export_onnx, verify_export
@@ -17,11 +16,10 @@ from cable_models.training.detector_evaluation import LOWEST_SCORE, Counted, Eva
 from cable_models.training.detector_state import Progress
 from cable_models.training.samples import LabelledImage, read_entries
 from cable_models.training.train_rtdetr import StepReport, TrainConfig, TrainingFiles, load_weights, train
-from cable_models.training.upload_views import WeightedFill, black, mean_colour
+
+from cable_rpc.study.region_fills import FILLS
 
 VERIFIED_IMAGES = 24
-FILLS = (WeightedFill(diffuse_background, 0.6), WeightedFill(black, 0.2), WeightedFill(mean_colour, 0.2))
-"""What stands outside the region in masked training images: mostly what the service shows its models."""
 NETWORK = CompactRtDetrConfig()
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from cable_codecs import diffuse_background
 from cable_models.training.segmentation_evaluation import MaskFigures, evaluate_masks
 from cable_models.training.segmentation_export import export_segmenter, pipeline_segmenter
 from cable_models.training.segmentation_samples import SegmentedImage, append_segmented, read_segmented
@@ -36,7 +37,7 @@ class SegmenterFigures:
 
     whole: MaskFigures
     masked: MaskFigures
-    """With all but a region around the true objects blacked out, as an edge sends it."""
+    """With all but a region around the true objects replaced as the service does."""
 
 
 def write_segmented(folder: Path, name: str, frame: Frame) -> None:
@@ -136,4 +137,4 @@ def camvid_frames(folder: Path) -> list[SegmentedImage]:
 def judge_segmenter(folder: Path, images: Sequence[SegmentedImage]) -> SegmenterFigures:
     """Held-out figures of a checkpoint folder through the pipeline."""
     segment = pipeline_segmenter(folder)
-    return SegmenterFigures(evaluate_masks(segment, images), evaluate_masks(segment, images, masked=True))
+    return SegmenterFigures(evaluate_masks(segment, images), evaluate_masks(segment, images, diffuse_background))

@@ -28,6 +28,7 @@ from cable_models.training.segmentation_state import averaged
 from cable_models.training.segmentation_trainer import StageConfig
 from cable_models.training.segmentation_views import ViewConfig, changed_view, filled_outside, random_region
 from cable_models.training.segmentation_vision import CONCEPTS, CompactSamConfig, VisionTrainee, concept_tokens
+from cable_models.training.upload_views import grey
 from torch.nn import functional
 
 TINY_SAM = CompactSamConfig(image_size=96, width=32, layers=2, heads=2, window=2, global_layers=(1,), channels=32)
@@ -64,7 +65,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> SegmenterTraining:
     torch.set_num_threads(1)
     work = tmp_path_factory.mktemp("segmenter")
     write_scenes(work / "train", 12)
-    training = SegmenterTraining(work, TINY, batch=4, views=ViewConfig(crop=0.3, colour=0, fill=0.2, jpeg=0))
+    training = SegmenterTraining(work, TINY, batch=4, views=ViewConfig(crop=0.3, colour=0, region_only=0.2, jpeg=0))
     for stage, steps in zip(STAGES, (60, 70, 60), strict=True):
         config = StageConfig(1.0, steps, learning_rate=4e-3, matrix_rate=8e-3, warmup_steps=5, average_decay=0.9)
         assert run_stage(training, stage, config, lambda progress, segment: None)
@@ -139,7 +140,7 @@ def test_views_keep_picture_and_truth_together() -> None:
     cv2.rectangle(instances, (20, 20), (60, 44), 1, -1)
     image[instances == 1] = 255
     sample = SegmentedImage(image, instances, np.array((0, 2), np.uint8))
-    plain = ViewConfig(colour=0, fill=0, jpeg=0)
+    plain = ViewConfig(colour=0, region_only=0, jpeg=0)
     for _ in range(20):
         view = changed_view(sample, (48, 32), plain, rng)
         inside = cv2.erode((view.instances == 1).astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
@@ -155,10 +156,11 @@ def test_what_a_fill_hides_is_no_object() -> None:
     )
     region = np.zeros((64, 64), bool)
     region[8:24, 8:40] = True
-    view = filled_outside(sample, region, rng)
+    view = filled_outside(sample, region, grey)
     assert (view.classes[region] == 1).all()
     assert not view.classes[~region].any()
     assert (view.image[region] == 77).all()
+    assert (view.image[~region] == 128).all()
     blocks = random_region(sample, rng).reshape(8, 8, 8, 8)
     assert (blocks.all(axis=(1, 3)) == blocks.any(axis=(1, 3))).all()
 

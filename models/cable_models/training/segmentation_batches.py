@@ -16,6 +16,7 @@ from cable_models.errors import ModelError
 from cable_models.training.segmentation_encoder import CELLS_PER_TOKEN
 from cable_models.training.segmentation_samples import CLASS_NAMES, SegmentedEntry, SegmentedImage, read_segmented
 from cable_models.training.segmentation_views import ViewConfig, changed_view, class_shares
+from cable_models.training.upload_views import CONSTANT_FILLS, WeightedFill
 
 PIXEL_MEAN = np.array((123.675, 116.28, 103.53), np.float32)
 PIXEL_STD = np.array((58.395, 57.12, 57.375), np.float32)
@@ -58,12 +59,21 @@ class Batch:
 class BatchMaker:
     """Draws batches from a sample folder; new files are taken up as they appear."""
 
-    def __init__(self, folder: Path, image_size: int, patch_size: int, batch: int, views: ViewConfig) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        image_size: int,
+        patch_size: int,
+        batch: int,
+        views: ViewConfig,
+        fills: Sequence[WeightedFill] = CONSTANT_FILLS,
+    ) -> None:
         self.folder = folder
         self.image_size = image_size
         self.patch_size = patch_size
         self.batch = batch
         self.views = views
+        self.fills = fills
         self.drawn = 0
         self.entries: Sequence[SegmentedEntry] = ()
 
@@ -96,7 +106,7 @@ class BatchMaker:
         shares = np.zeros((self.batch, 1 + len(CLASS_NAMES), CELLS_PER_TOKEN * rows, cells), np.float32)
         filled = round(picture_hw[0] * cells / size)
         for row, sample in enumerate(self.samples(rng)):
-            view = changed_view(sample, (picture_hw[1], picture_hw[0]), self.views, rng)
+            view = changed_view(sample, (picture_hw[1], picture_hw[0]), self.views, rng, self.fills)
             pixels[row, :, : picture_hw[0]] = normalised(view.image)
             shares[row, :, :filled] = class_shares(view, (filled, cells))
         return Batch(torch.from_numpy(pixels), torch.from_numpy(shares))

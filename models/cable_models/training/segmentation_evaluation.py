@@ -15,8 +15,8 @@ from torch.nn import functional
 from cable_models.detection import Image
 from cable_models.lisa.images import sam_input
 from cable_models.training.segmentation_samples import SegmentedImage
-from cable_models.training.segmentation_views import BLOCK
 from cable_models.training.segmentation_vision import CONCEPTS, VisionTrainee
+from cable_models.training.upload_views import BLOCK, RegionFill
 
 BoolMask = npt.NDArray[np.bool_]
 
@@ -45,21 +45,22 @@ class MaskFigures:
 
 
 @torch.no_grad()
-def evaluate_masks(segment: Segment, samples: Sequence[SegmentedImage], *, masked: bool = False) -> MaskFigures:
+def evaluate_masks(segment: Segment, samples: Sequence[SegmentedImage], fill: RegionFill | None = None) -> MaskFigures:
     """Pooled IoU per concept.
 
     Args:
         segment: The model.
         samples: Images with truth.
-        masked: Black out all but a region around the true objects first, as an edge would, and tell the region.
+        fill: Fills all but a region around the true objects first, and the model is told that region; None shows
+            it whole images.
     """
     overlap = np.zeros(len(CONCEPTS))
     union = np.zeros(len(CONCEPTS))
     for sample in samples:
         image, region = sample.image, None
-        if masked:
+        if fill is not None:
             region = object_region(sample)
-            image = np.where(region[..., None], image, np.uint8(0))
+            image = fill(image, region)
         found = segment(image, region)
         classes = sample.classes
         for index, (_, covered) in enumerate(CONCEPTS):

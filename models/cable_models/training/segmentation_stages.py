@@ -10,7 +10,7 @@ goes on from its own checkpoint where it has one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -36,6 +36,7 @@ from cable_models.training.segmentation_tokenizer import write_tokenizer
 from cable_models.training.segmentation_trainer import LossTerms, StageConfig, StageProgress, train_stage
 from cable_models.training.segmentation_views import ViewConfig
 from cable_models.training.segmentation_vision import CONCEPTS, VisionTrainee, concept_shares, concept_tokens
+from cable_models.training.upload_views import CONSTANT_FILLS, WeightedFill
 
 Stage = Literal["encoder", "decoder", "language"]
 STAGES: tuple[Stage, ...] = get_args(Stage)
@@ -63,6 +64,8 @@ class SegmenterTraining:
     network: CompactLisaConfig = field(default_factory=CompactLisaConfig)
     batch: int = 8
     views: ViewConfig = field(default_factory=ViewConfig)
+    fills: Sequence[WeightedFill] = CONSTANT_FILLS
+    """What may stand outside the region in masked images."""
     seed: int = 0
 
     def checkpoint(self, stage: Stage) -> Path:
@@ -86,7 +89,7 @@ class SegmenterTraining:
     def batches(self) -> BatchMaker:
         """Batches of this network's size."""
         sam = self.network.sam
-        return BatchMaker(self.work / "train", sam.image_size, sam.patch_size, self.batch, self.views)
+        return BatchMaker(self.work / "train", sam.image_size, sam.patch_size, self.batch, self.views, self.fills)
 
     def fresh_vision(self) -> VisionTrainee:
         """SAM before any training."""

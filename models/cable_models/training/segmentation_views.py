@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cable_models.detection import Image
 from cable_models.training.augment import jitter_colour, jpeg_recoded
 from cable_models.training.segmentation_samples import CLASS_NAMES, SegmentedImage
+from cable_models.training.upload_views import (
+    BLOCK,
+    CONSTANT_FILLS,
+    CORRIDOR_SHARE,
+    RegionFill,
+    WeightedFill,
+    corridor_blocks,
+    draw_fill,
+)
 
 RARE_CLASSES = (2, 3)
-BLOCK = 8
-"""Side of the blocks that an edge keeps or fills, pixels."""
+WHOLE_ROWS_SHARE = 0.15
+"""Share of the regions that are grown to whole rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +37,19 @@ class ViewConfig:
     rare_centre: float = 0.5
     """Share of crops laid around a pedestrian or cyclist."""
     colour: float = 0.7
-    fill: float = 0.35
+    region_only: float = 0.5
     """Share of images of which only a region around the objects is kept, as an edge uploads them."""
     jpeg: float = 0.45
 
 
 def changed_view(
-    sample: SegmentedImage, size_wh: tuple[int, int], config: ViewConfig, rng: np.random.Generator
+    sample: SegmentedImage,
+    size_wh: tuple[int, int],
+    config: ViewConfig,
+    rng: np.random.Generator,
+    fills: Sequence[WeightedFill] = CONSTANT_FILLS,
 ) -> SegmentedImage:
-    """A changed copy of ``size_wh`` pixels; what a fill hides is background."""
+    """A changed copy of ``size_wh`` pixels; what one of the fills hides is background."""
     view = random_crop(sample, size_wh, config, rng)
     if rng.random() < config.flip:
         view = SegmentedImage(
@@ -44,8 +57,8 @@ def changed_view(
         )
     if rng.random() < config.colour:
         view = SegmentedImage(jitter_colour(view.image, rng), view.instances, view.table)
-    if rng.random() < config.fill:
-        view = filled_outside(view, random_region(view, rng), rng)
+    if rng.random() < config.region_only:
+        view = filled_outside(view, random_region(view, rng), draw_fill(fills, rng))
     if rng.random() < config.jpeg:
         view = SegmentedImage(jpeg_recoded(view.image, int(rng.integers(20, 91))), view.instances, view.table)
     return view
@@ -105,20 +118,18 @@ def random_region(view: SegmentedImage, rng: np.random.Generator) -> npt.NDArray
     padded = np.zeros((rows * BLOCK, columns * BLOCK), np.uint8)
     padded[:height, :width] = region
     blocks = padded.reshape(rows, BLOCK, columns, BLOCK).max(axis=(1, 3)) > 0
-    if rng.random() < 0.25:
+    if rng.random() < CORRIDOR_SHARE and blocks.any():
+        blocks = corridor_blocks(blocks)
+    if rng.random() < WHOLE_ROWS_SHARE:
         # Image codecs send whole rows.
         blocks |= blocks.any(axis=1, keepdims=True)
     pixels: npt.NDArray[np.bool_] = blocks.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
     return pixels
 
 
-def filled_outside(view: SegmentedImage, region: npt.NDArray[np.bool_], rng: np.random.Generator) -> SegmentedImage:
-    """The image with black, grey or its mean colour outside the region, where nothing counts as an object."""
-    kind = int(rng.choice(3, p=[0.6, 0.25, 0.15]))
-    mean: Image = view.image.reshape(-1, 3).mean(axis=0).astype(np.uint8)
-    colour = (np.zeros(3, np.uint8), np.full(3, 128, np.uint8), mean)[kind]
-    image = np.where(region[..., None], view.image, colour)
-    return SegmentedImage(image, np.where(region, view.instances, np.uint16(0)), view.table)
+def filled_outside(view: SegmentedImage, region: npt.NDArray[np.bool_], fill: RegionFill) -> SegmentedImage:
+    """The image filled outside the region, where nothing counts as an object."""
+    return SegmentedImage(fill(view.image, region), np.where(region, view.instances, np.uint16(0)), view.table)
 
 
 def class_shares(view: SegmentedImage, grid_hw: tuple[int, int]) -> npt.NDArray[np.float32]:
