@@ -216,7 +216,9 @@ def _truth_quality(frame: Frame, roi: BoolMask, detections: Detections) -> dict[
     if truth is None:
         return {}
     asked = visible_truth(truth)
-    counts = match_detections(detections, truth.boxes_xyxy, truth.class_ids, counted=asked)
+    counts = match_detections(
+        detections, truth.boxes_xyxy, truth.class_ids, counted=asked, ignored_boxes=truth.ignored_boxes_xyxy
+    )
     curve = recognition_curve(truth.boxes_xyxy[asked], roi).tolist()
     names = ("recognised", "recognised_25", "recognised_50", "recognised_75", "recognised_95")
     return {

@@ -6,16 +6,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cable_rpc.study.metrics import (
+    GROUPS,
+    SIZE_BINS,
+    MaskOverlap,
     MatchCounts,
+    RetentionCounts,
+    asked_truth,
     box_iou,
+    group_indices,
     macro_frame,
     mask_iou,
+    mask_overlap,
     match_detections,
     percentiles,
     recognition_curve,
     retained,
     roi_overlap,
     scores_of,
+    size_bins,
     visible_truth,
 )
 from cable_rpc.types import Detections, GroundTruth
@@ -69,6 +77,35 @@ def test_objects_that_are_not_asked_for_are_neither_miss_nor_mistake() -> None:
     found = detections((50, 50, 52, 52, CAR, 0.9))
     counts = match_detections(found, boxes, classes, counted=np.array([True, False]))
     assert (counts.true_positives, counts.false_positives, counts.false_negatives) == (0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        # half of the detection lies in the region
+        ((95, 0, 105, 10), (0, 0, 1)),
+        # a little less than half
+        ((94, 0, 104, 10), (0, 1, 1)),
+        # halves in two regions that touch make one of them hold half
+        ((195, 0, 205, 10), (0, 0, 1)),
+        # a region doesn't take a detection away from an object
+        ((100, 0, 110, 10), (1, 0, 0)),
+    ],
+)
+def test_detections_in_ignored_regions(found: tuple[float, ...], expected: tuple[int, int, int]) -> None:
+    boxes, classes = np.array([[100, 0, 110, 10]], np.float32), np.array([CAR], np.int32)
+    regions = np.array([[100, 0, 200, 50], [200, 0, 300, 50]], np.float32)
+    found_row = detections((*found, CAR, 0.9))  # type: ignore[arg-type]
+    counts = match_detections(found_row, boxes, classes, ignored_boxes=regions)
+    assert (counts.true_positives, counts.false_positives, counts.false_negatives) == expected
+
+
+def test_an_ignored_region_never_fills_up() -> None:
+    many = detections(*[(10 * i, 0, 10 * i + 9, 9, CAR, 0.9) for i in range(5)])
+    nothing = np.zeros((0, 4), np.float32), np.zeros(0, np.int32)
+    region = np.array([[0, 0, 100, 100]], np.float32)
+    assert match_detections(many, *nothing, ignored_boxes=region) == MatchCounts(0, 0, 0)
+    assert match_detections(many, *nothing) == MatchCounts(0, 5, 0)
 
 
 @given(
@@ -137,6 +174,47 @@ def test_visible_truth_asks_for_height_and_openness() -> None:
         np.array([1.0, 1.0, 0.4], np.float32),
     )
     assert visible_truth(truth).tolist() == [True, False, False]
+
+
+def test_variants_groups_and_sizes_of_the_truth() -> None:
+    heights = [24.9, 25, 49, 50, 99, 100, 300]
+    classes = [0, 1, 3, 2, 5, 7, 16]
+    truth = GroundTruth(
+        np.array([[0, 0, 9, height] for height in heights], np.float32),
+        np.array(classes, np.int32),
+        np.arange(7, dtype=np.int32),
+        np.ones(7, np.float32),
+    )
+    assert [SIZE_BINS[place] for place in size_bins(truth)] == [
+        "<25 px",
+        *["25-50 px"] * 2,
+        *["50-100 px"] * 2,
+        *[">=100 px"] * 2,
+    ]
+    assert [GROUPS[place] for place in group_indices(truth.class_ids)[:6]] == [
+        "pedestrian",
+        *["cyclist"] * 2,
+        *["vehicle"] * 3,
+    ]
+    # an animal is of no counted class
+    assert asked_truth(truth, "all").tolist() == [True] * 6 + [False]
+    assert asked_truth(truth, "visible").tolist() == [False, *[True] * 5, False]
+
+
+def test_retention_pools() -> None:
+    pooled = RetentionCounts(1, 2, 1) + RetentionCounts(3, 3, 0)
+    assert (pooled.rate, pooled.spurious_rate) == (pytest.approx(4 / 5), pytest.approx(1 / 5))
+    nothing = RetentionCounts(0, 0, 0)
+    assert (nothing.rate, nothing.spurious_rate) == (None, None)
+
+
+def test_mask_overlap_pools_pixels() -> None:
+    first, second = np.zeros((4, 4), np.bool_), np.zeros((4, 4), np.bool_)
+    first[:2] = second[1:3] = True
+    pooled = mask_overlap(first, second) + mask_overlap(first, first)
+    assert pooled == MaskOverlap(4 + 8, 12 + 8)
+    assert pooled.iou == pytest.approx(12 / 20)
+    assert MaskOverlap(0, 0).iou == 1
 
 
 def test_mask_iou_by_hand() -> None:
