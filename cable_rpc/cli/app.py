@@ -15,9 +15,11 @@ from cable_rpc.cli.codec_study import codec_study
 from cable_rpc.cli.demo import demo
 from cable_rpc.cli.doctor import doctor
 from cable_rpc.cli.export import export_app
+from cable_rpc.cli.figure import figure
 from cable_rpc.cli.inspect import inspect
 from cable_rpc.cli.serve import serve
 from cable_rpc.cli.stream import stream
+from cable_rpc.cli.tables import tables
 from cable_rpc.cli.train import train_app
 from cable_rpc.cli.train_segmenter import segmenter
 from cable_rpc.cli.verify import verify_app
@@ -35,7 +37,9 @@ app.command()(serve)
 app.command()(stream)
 app.command()(demo)
 app.command()(inspect)
+app.command()(figure)
 app.command()(codec_study)
+app.command()(tables)
 app.command()(doctor)
 app.add_typer(verify_app, name="verify")
 app.add_typer(export_app, name="export")

@@ -54,7 +54,10 @@ def tables(
     ] = False,
     table: Annotated[str, typer.Option(help="1 (across data sets) | 2 (strategies) | both.")] = "both",
     out: Annotated[
-        Path, typer.Option(help="Folder for tables.md, table1.tex, table1.csv, table2.tex, table2.csv and the cells.")
+        Path,
+        typer.Option(
+            help="Folder for tables.md, table1.tex, table1.csv, table2.tex, table2.csv, figures.csv and the cells."
+        ),
     ] = Path("out/tables"),
     workers: Annotated[int, typer.Option(help="Processes, each with its own models and one sequence.", min=1)] = 2,
     max_frames: Annotated[int | None, typer.Option(help="Frames of each sequence at most.", min=1)] = None,

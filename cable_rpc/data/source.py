@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import parse_qsl
@@ -136,7 +137,26 @@ def synthetic_options(rest: str, query: str) -> dict[str, str]:
     return options
 
 
-SOURCES: Mapping[str, SourceFactory] = {"video": open_video, "synthetic": open_synthetic}
+def data_set(package: str, opener: str) -> SourceFactory:
+    """A data set's factory, whose package is imported when it is first used."""
+
+    def open_sequence(rest: str, options: SourceOptions) -> FrameSource:
+        factory: SourceFactory = getattr(import_module(package), opener)
+        return factory(rest, options)
+
+    return open_sequence
+
+
+SOURCES: Mapping[str, SourceFactory] = {
+    "video": open_video,
+    "synthetic": open_synthetic,
+    "nuscenes": data_set("cable_rpc.data.nuscenes", "open_nuscenes"),
+    "waymo": data_set("cable_rpc.data.waymo", "open_waymo"),
+    "kitti": data_set("cable_rpc.data.kitti", "open_kitti"),
+    "cadc": data_set("cable_rpc.data.cadc", "open_cadc"),
+    "wod_zb": data_set("cable_rpc.data.coco", "open_wod_zb"),
+    "coco-video": data_set("cable_rpc.data.coco", "open_coco_video"),
+}
 """Scheme to factory."""
 
 
@@ -149,18 +169,21 @@ def open_source(
     intrinsics: CameraIntrinsics | None = None,
     fps: float | None = None,
     mount: CameraMount | None = None,
+    bad_frames: BadFrames | None = None,
 ) -> FrameSource:
     """Open a frame source.
 
     Args:
-        spec: ``video:FILE``, ``video:FOLDER`` of images, or ``synthetic:SEED`` with options such as
-            ``?route=turns&traffic=none`` (`SyntheticConfig`).
+        spec: ``video:FILE``, ``video:FOLDER`` of images, ``synthetic:SEED`` with options such as
+            ``?route=turns&traffic=none`` (`SyntheticConfig`), or a sequence of a data set such as
+            ``kitti:ROOT#0002`` (docs/datasets.md).
         max_frames: stop after that many frames.
         ego_csv: ego-motion log for a video (``cable_rpc.data.ego_csv``).
         size: (width, height) to resize to; intrinsics are scaled along.
         intrinsics: the camera, in pixels of the video's own size.
         fps: frame rate; a video of a higher rate is thinned, a folder of images is played at it.
         mount: where the camera of a video sits on its vehicle.
+        bad_frames: takes note of damaged frames and label rows of a data set; None makes any an error.
 
     Raises:
         ConfigurationError: unknown scheme or unusable option.
@@ -172,4 +195,5 @@ def open_source(
         known = ", ".join(f"{name}:..." for name in sorted(SOURCES))
         hint = f"; for a file write 'video:{spec}'" if Path(spec).exists() else ""
         raise ConfigurationError(f"can't open source '{spec}': known are {known}{hint}")
-    return factory(rest, SourceOptions(max_frames, ego_csv, size, intrinsics, fps, mount))
+    options = SourceOptions(max_frames, ego_csv, size, intrinsics, fps, mount, bad_frames or BadFrames())
+    return factory(rest, options)

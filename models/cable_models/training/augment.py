@@ -54,13 +54,11 @@ def augment(
     image = sample.image
     if rng.random() < config.colour:
         image = jitter_colour(image, rng)
-    sample = LabelledImage(image, sample.boxes_xyxy, sample.class_ids, sample.visibility)
-    if rng.random() < config.region_only:
-        sample = keep_region(sample, draw_fill(fills, rng), rng)
     if rng.random() < config.jpeg:
-        recoded = jpeg_recoded(sample.image, int(rng.integers(20, 90)))
-        sample = LabelledImage(recoded, sample.boxes_xyxy, sample.class_ids, sample.visibility)
-    return sample
+        image = jpeg_recoded(image, int(rng.integers(20, 90)))
+    sample = LabelledImage(image, sample.boxes_xyxy, sample.class_ids, sample.visibility)
+    # Last, since the service fills the background after decoding.
+    return keep_region(sample, draw_fill(fills, rng), rng) if rng.random() < config.region_only else sample
 
 
 def random_crop(

@@ -57,10 +57,11 @@ def changed_view(
         )
     if rng.random() < config.colour:
         view = SegmentedImage(jitter_colour(view.image, rng), view.instances, view.table)
-    if rng.random() < config.region_only:
-        view = filled_outside(view, random_region(view, rng), draw_fill(fills, rng))
     if rng.random() < config.jpeg:
         view = SegmentedImage(jpeg_recoded(view.image, int(rng.integers(20, 91))), view.instances, view.table)
+    # Last, since the service fills the background after decoding.
+    if rng.random() < config.region_only:
+        view = filled_outside(view, random_region(view, rng), draw_fill(fills, rng))
     return view
 
 

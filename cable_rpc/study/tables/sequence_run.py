@@ -1,0 +1,187 @@
+"""One sequence under several strategies at once: each frame is read once, and sent whole once, for all of them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, replace
+
+from cable_codecs import CodecError, RegionTreatment
+
+from cable_rpc.data.bad_frames import BadFrames
+from cable_rpc.data.source import FrameSource, open_source
+from cable_rpc.edge.baselines import OpenLoop
+from cable_rpc.edge.capture import CapturedFrame
+from cable_rpc.edge.roi_tracker import RoiTracker
+from cable_rpc.edge.strategy import FullFrame, RoiStrategy
+from cable_rpc.errors import CableError, SourceError
+from cable_rpc.study.sequence_metrics import OPERATING_SCORE, SequenceMeter
+from cable_rpc.study.strategies import open_strategy
+from cable_rpc.study.tables.cells import Cell
+from cable_rpc.study.tables.lane import Lane, LaneSettings, Passage
+from cable_rpc.study.tables.measured_frame import measured_frame
+from cable_rpc.study.tables.models import LoadedModels, load_models
+from cable_rpc.study.tables.settings import FULL_FRAME, REFERENCE_CODEC, RunSettings, SequenceRequest
+from cable_rpc.types import Frame
+
+log = logging.getLogger(__name__)
+
+ModelLoader = Callable[[RunSettings], LoadedModels]
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceTask:
+    """What a worker is given at a time."""
+
+    request: SequenceRequest
+    strategies: tuple[str, ...]
+    settings: RunSettings
+
+
+@dataclass(slots=True)
+class RunningStrategy:
+    """One strategy under way: its measurements so far, or what ended it."""
+
+    name: str
+    lane: Lane | None
+    """None where the reference's passages are its own."""
+    meter: SequenceMeter
+    error: str = ""
+
+
+def run_sequence(task: SequenceTask, load: ModelLoader = load_models) -> list[Cell]:
+    """Run a sequence under each strategy; what fails is a cell with its error, in place of an exception."""
+    bad = BadFrames(skip=task.settings.skip_bad)
+    common = Cell(task.request, "")
+    running: list[RunningStrategy] = []
+    error = ""
+    try:
+        source = open_sequence(task, bad)
+        common = replace(common, sequence=source.name)
+        models = load(task.settings)
+        detector, segmenter = models.names
+        common = replace(common, detector=detector, segmenter=segmenter)
+        asyncio.run(run_strategies(task, source, models, running))
+    except Exception as failure:
+        error = told(failure)
+    common = replace(common, skipped=tuple(bad.skipped))
+    if error:
+        return [replace(common, strategy=strategy, error=error) for strategy in task.strategies]
+    return [
+        replace(common, strategy=one.name, metrics=None if one.error else one.meter.metrics(), error=one.error)
+        for one in running
+    ]
+
+
+def told(failure: Exception) -> str:
+    """An error as one line; the trace of one that nobody raised on purpose goes to the log."""
+    if isinstance(failure, (CableError, CodecError)):
+        return str(failure)
+    log.error("a cell failed", exc_info=failure)
+    return f"{type(failure).__name__}: {failure}"
+
+
+def open_sequence(task: SequenceTask, bad: BadFrames) -> FrameSource:
+    """The sequence's source."""
+    settings = task.settings
+    return open_source(
+        task.request.spec,
+        max_frames=settings.max_frames,
+        size=settings.size,
+        fps=settings.fps,
+        bad_frames=bad,
+    )
+
+
+async def run_strategies(
+    task: SequenceTask, source: FrameSource, models: LoadedModels, running: list[RunningStrategy]
+) -> None:
+    """Take every frame through the reference and then through each strategy that still runs.
+
+    Raises:
+        SourceError: the source can't be read, or has no frame.
+        CableError, CodecError: the reference failed, without which nothing can be judged.
+    """
+    settings = task.settings
+    async with AsyncExitStack() as stack:
+        reference = await stack.enter_async_context(
+            Lane(FullFrame(settings.block_size), reference_settings(settings), source, models)
+        )
+        running.extend([await start(name, settings, source, models, stack) for name in task.strategies])
+        count = 0
+        for captured in captured_frames(source):
+            whole = await reference.carry(captured)
+            for one in running:
+                await advance(one, captured, whole)
+            count += 1
+        if count == 0:
+            raise SourceError(f"'{task.request.spec}' has no frames; choose another sequence or allow more of them")
+
+
+async def start(
+    name: str, settings: RunSettings, source: FrameSource, models: LoadedModels, stack: AsyncExitStack
+) -> RunningStrategy:
+    """Open one strategy's lane."""
+    meter = SequenceMeter(source.name, source.fps)
+    if name == FULL_FRAME and settings.codec == REFERENCE_CODEC:
+        return RunningStrategy(name, None, meter)
+    try:
+        lane = Lane(strategy_with_steps(name, settings), lane_settings(settings), source, models)
+        return RunningStrategy(name, await stack.enter_async_context(lane), meter)
+    except Exception as failure:
+        return RunningStrategy(name, None, meter, told(failure))
+
+
+async def advance(one: RunningStrategy, captured: CapturedFrame, whole: Passage) -> None:
+    """One more frame of a strategy that has not failed."""
+    if one.error:
+        return
+    try:
+        passage = whole if one.lane is None else await one.lane.carry(captured)
+        one.meter.add(measured_frame(captured.frame, passage, whole))
+    except Exception as failure:
+        where = f"frame {captured.frame.index}"
+        text = told(failure)
+        one.error = text if text.startswith(where) else f"{where}: {text}"
+
+
+def captured_frames(source: FrameSource) -> Iterator[CapturedFrame]:
+    """The frames, each as if it had just come from the camera."""
+    frames: Iterator[Frame] = iter(source)
+    while True:
+        started_ns = time.monotonic_ns()
+        frame = next(frames, None)
+        if frame is None:
+            return
+        now_ns = time.monotonic_ns()
+        yield CapturedFrame(frame, now_ns - started_ns, now_ns)
+
+
+def strategy_with_steps(name: str, settings: RunSettings) -> RoiStrategy:
+    """A fresh strategy that shows R_k itself where it can.
+
+    Raises:
+        ConfigurationError: unknown name.
+    """
+    config, block_size = settings.roi, settings.block_size
+    if name == "cable":
+        return RoiTracker(config, block_size, keep_steps=True)
+    if name == "no-corridor":
+        return RoiTracker(replace(config, corridor=False), block_size, keep_steps=True)
+    if name == "open-loop":
+        return OpenLoop(config, block_size, keep_steps=True)
+    return open_strategy(name, config, block_size)
+
+
+def lane_settings(settings: RunSettings) -> LaneSettings:
+    """How the strategies' frames are coded."""
+    return LaneSettings(settings.codec, settings.quality, settings.used_treatment, settings.prompt, OPERATING_SCORE)
+
+
+def reference_settings(settings: RunSettings) -> LaneSettings:
+    """How whole frames are coded: nothing of them is treated."""
+    treatment = RegionTreatment.default_for(stateless=False)
+    return LaneSettings(REFERENCE_CODEC, settings.reference_quality, treatment, settings.prompt, OPERATING_SCORE)
