@@ -41,7 +41,10 @@ def test_help_teaches(command: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["stream", "--source", "nonsense"], "can't open source 'nonsense': known are cadc:..., coco-video:..., kitti:..., "),
+        (
+            ["stream", "--source", "nonsense"],
+            "can't open source 'nonsense': known are cadc:..., coco-video:..., kitti:..., ",
+        ),
         (["stream", "--source", "video:absent.mp4"], "absent.mp4"),
         (["stream", "--source", "synthetic:1", "--codec", "theora"], "use one of h264"),
         (["stream", "--source", "synthetic:1", "--size", "big"], "WIDTHxHEIGHT"),
