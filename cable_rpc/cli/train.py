@@ -188,15 +188,16 @@ def export(files: DetectorFiles, target: Path, console: Console) -> None:
 
 def judge(files: DetectorFiles, target: Path, clips: Sequence[str], console: Console) -> None:
     """Prints the figures of the exported file on the held-out frames and on labelled clips."""
-    from cable_models.training.detector_evaluation import EVERY_OBJECT, Counted
+    from cable_models.training.detector_evaluation import EVERY_OBJECT, HALF_VISIBLE, Counted
     from cable_models.training.labelled_clips import read_clip
 
     from cable_rpc.study.train_detector import onnx_figures
 
     sets = {"held-out rendered frames": files.held_out(), **{name: read_clip(name) for name in clips}}
     for name, samples in sets.items():
-        large, every = onnx_figures(target, samples, (Counted(), EVERY_OBJECT))
+        large, free, every = onnx_figures(target, samples, (Counted(), HALF_VISIBLE, EVERY_OBJECT))
         console.print(figures_table(f"{name}, objects of 6 % of the height and more", large))
+        console.print(figures_table(f"{name}, those of them that are at least half visible", free))
         console.print(figures_table(f"{name}, smaller objects too", every))
 
 

@@ -33,6 +33,8 @@ class Counted:
 
 
 EVERY_OBJECT = Counted(min_height=12 / 540)
+HALF_VISIBLE = Counted(min_visibility=0.5)
+"""What quality figures of streams ask for."""
 
 
 @dataclass(frozen=True, slots=True)
