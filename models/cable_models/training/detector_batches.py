@@ -43,6 +43,9 @@ VIEWS = (
     View(0.5, 0.625, 2.0, AugmentConfig(crop=1.0, crop_shares=(0.35, 0.85))),
 )
 
+CLOSING_VIEWS = (View(1.0, 1.0, 1.0, AugmentConfig(crop=0.0, colour=0.5, region_only=0.35)),)
+"""What the end of a training shows: whole frames, as the detector will see them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Batch:

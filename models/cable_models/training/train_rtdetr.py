@@ -24,12 +24,15 @@ from cable_models.rtdetr.compact import CLASS_PRIOR, CompactRtDetrConfig, build_
 from cable_models.rtdetr.export import detect_with_torch
 from cable_models.rtdetr.labels import coco_index_table
 from cable_models.training.dense_loss import DenseHead, dense_loss
-from cable_models.training.detector_batches import Batch, next_batch
+from cable_models.training.detector_batches import CLOSING_VIEWS, VIEWS, Batch, next_batch
 from cable_models.training.detector_evaluation import LOWEST_SCORE, Evaluation, evaluate
 from cable_models.training.detector_state import Progress, load_state, save_state
 from cable_models.training.samples import LabelledImage
 from cable_models.training.sampling import BalancedSampler
 from cable_models.training.upload_views import CONSTANT_FILLS, WeightedFill
+
+CLOSING_SHARE = 0.85
+"""Share of the training from which on crops are no longer shown."""
 
 log = logging.getLogger(__name__)
 
@@ -143,8 +146,9 @@ def train(
     while share_gone(config, progress) < 1 and not should_stop():
         gone = share_gone(config, progress)
         set_learning_rate(trainee.optimiser, learning_rate(config, progress.step, gone))
+        views = VIEWS if gone < CLOSING_SHARE else CLOSING_VIEWS
         batch = next_batch(
-            sampler, network, config.batch, config.min_height_px, config.min_visibility, rng, fills=fills
+            sampler, network, config.batch, config.min_height_px, config.min_visibility, rng, views, fills
         )
         loss = train_step(trainee, batch, config, device)
         progress.step += 1
