@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from cable_rpc.cli.roi_options import roi_config
+from cable_rpc.cli.skip_bad import SkipBad, bad_frames_listed
 from cable_rpc.cli.stream import parse_size
 from cable_rpc.cloud.backends import BackendOptions, Detector, Segmenter, load_detector, load_segmenter
 from cable_rpc.data.source import open_source
@@ -58,6 +59,7 @@ def figure(
     min_score: Annotated[float, typer.Option(help="Detections below are dropped.", min=0.0, max=1.0)] = 0.4,
     size: Annotated[str | None, typer.Option(help="Resize to WIDTHxHEIGHT before anything else.")] = None,
     fps: Annotated[float | None, typer.Option(help="Thin drives to this rate; rate of image folders.")] = None,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Show example frames: original, whole frame, each strategy's region with its detections, region mask.
 
@@ -76,16 +78,17 @@ def figure(
     chosen = tuple(dict.fromkeys(strategy or ("motion-only", "cable")))
     settings = FigureSettings(chosen, roi_config(mode, roi or ()), codec, quality, prompt, min_score)
     numbers = frame_numbers(frames)
-    opened = [open_source(source, size=parse_size(size), fps=fps) for source in sources]
-    models = load_models(detector, segmenter, BackendOptions(device, threads, min_score))
     rows: list[FigureRow] = []
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        for source in opened:
-            task = progress.add_task(source.name, total=max(numbers) + 1 if numbers else None)
-            rows += figure_rows(source, numbers, settings, *models, FrameProgress(progress, task))
-    write_figure(rows, out)
-    print(f"wrote {out}")
+    with bad_frames_listed(skip_bad) as bad_frames:
+        opened = [open_source(source, size=parse_size(size), fps=fps, bad_frames=bad_frames) for source in sources]
+        models = load_models(detector, segmenter, BackendOptions(device, threads, min_score))
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            for source in opened:
+                task = progress.add_task(source.name, total=max(numbers) + 1 if numbers else None)
+                rows += figure_rows(source, numbers, settings, *models, FrameProgress(progress, task))
+        write_figure(rows, out)
+        print(f"wrote {out}")
 
 
 @dataclass

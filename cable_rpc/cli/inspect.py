@@ -15,10 +15,11 @@ from rich.console import Console
 from rich.progress import track
 
 from cable_rpc.cli.roi_options import MODES, roi_config
+from cable_rpc.cli.skip_bad import SkipBad, bad_frames_listed
 from cable_rpc.cli.stream import camera_mount, centred_intrinsics, parse_size
 from cable_rpc.cloud.backends import BackendOptions, load_detector
 from cable_rpc.cloud.segmenters import RandomAccessSource
-from cable_rpc.data.source import FrameSource, open_source
+from cable_rpc.data.source import SOURCE_FORMS, FrameSource, open_source
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.inspect_loop import DetectorCloud, inspect_last
 from cable_rpc.study.inspect_sheet import draw_sheet
@@ -30,9 +31,7 @@ QUIET_FRAMES = 3
 
 
 def inspect(
-    source: Annotated[
-        str, typer.Option(help="video:FILE, video:FOLDER of images, or synthetic:SEED.", metavar="SCHEME:...")
-    ],
+    source: Annotated[str, typer.Option(help=f"{SOURCE_FORMS}.", metavar="SCHEME:...")],
     frame: Annotated[int, typer.Option(help="Number of the frame to show, from 0; counted after --fps.", min=0)],
     out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("out/inspect.png"),
     mode: Annotated[
@@ -71,6 +70,7 @@ def inspect(
     ] = None,
     camera_pitch: Annotated[float, typer.Option(help="Degrees by which that camera looks below the horizontal.")] = 0.0,
     block_size: Annotated[int, typer.Option(help="Grid that the region is grown to; 1 = exact.", min=1)] = 8,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Show how one frame's region of interest came about: every step of the method, labelled, on one sheet.
 
@@ -91,26 +91,28 @@ def inspect(
     if roi and mode == "paper":
         raise ConfigurationError("--roi changes the robust mode, which --mode paper leaves out; use robust or both")
     answering, told = cloud_model(cloud, detector, min_score)
-    opened = open_source(
-        source,
-        ego_csv=ego_csv,
-        size=parse_size(size),
-        intrinsics=centred_intrinsics(focal, source),
-        fps=fps,
-        mount=camera_mount(camera_height, camera_pitch),
-    )
-    first = max(0, frame - lead_in)
-    frames = window(opened, first, frame)
-    if isinstance(answering, TruthCloud):
-        frames = with_true_masks(frames)
-    running = with_progress(frames, frame - first + 1)
-    views = inspect_last(running, configs, answering, delay=delay, block_size=block_size)
-    height, width = views[-1].frame.size_hw
-    late = "1 frame" if delay == 1 else f"{delay} frames"
-    subtitle = f"{width} \N{MULTIPLICATION SIGN} {height} px \N{MIDDLE DOT} cloud: {told}, {late} later"
-    subtitle += f" \N{MIDDLE DOT} loop run from frame {first}"
-    write_png(out, draw_sheet(views, f"Frame {frame} of {opened.name}", subtitle))
-    print(f"wrote {out}")
+    with bad_frames_listed(skip_bad) as bad_frames:
+        opened = open_source(
+            source,
+            ego_csv=ego_csv,
+            size=parse_size(size),
+            intrinsics=centred_intrinsics(focal, source, bad_frames),
+            fps=fps,
+            mount=camera_mount(camera_height, camera_pitch),
+            bad_frames=bad_frames,
+        )
+        first = max(0, frame - lead_in)
+        frames = window(opened, first, frame)
+        if isinstance(answering, TruthCloud):
+            frames = with_true_masks(frames)
+        running = with_progress(frames, frame - first + 1)
+        views = inspect_last(running, configs, answering, delay=delay, block_size=block_size)
+        height, width = views[-1].frame.size_hw
+        late = "1 frame" if delay == 1 else f"{delay} frames"
+        subtitle = f"{width} \N{MULTIPLICATION SIGN} {height} px \N{MIDDLE DOT} cloud: {told}, {late} later"
+        subtitle += f" \N{MIDDLE DOT} loop run from frame {first}"
+        write_png(out, draw_sheet(views, f"Frame {frame} of {opened.name}", subtitle))
+        print(f"wrote {out}")
 
 
 def window(source: FrameSource, first: int, last: int) -> Iterator[Frame]:

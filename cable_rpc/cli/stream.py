@@ -15,7 +15,9 @@ from rich.console import Console
 
 from cable_rpc.cli.progress import RunProgress
 from cable_rpc.cli.roi_options import region_treatment, roi_config
-from cable_rpc.data.source import FrameSource, open_source
+from cable_rpc.cli.skip_bad import SkipBad, bad_frames_listed
+from cable_rpc.data.bad_frames import BadFrames
+from cable_rpc.data.source import SOURCE_FORMS, FrameSource, open_source
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.strategies import STRATEGIES
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
@@ -30,7 +32,7 @@ def stream(
     source: Annotated[
         str,
         typer.Option(
-            help="video:FILE, video:FOLDER of images, or synthetic:SEED[?route=turns&traffic=none].",
+            help=f"{SOURCE_FORMS}.",
             metavar="SCHEME:...",
         ),
     ],
@@ -107,6 +109,7 @@ def stream(
             help="Stream the same frames whole afterwards: byte saving, detection retention, annotated video."
         ),
     ] = True,
+    skip_bad: SkipBad = False,
 ) -> None:
     """Stream a camera through the loop and measure what it costs.
 
@@ -117,15 +120,6 @@ def stream(
     if codec not in CODECS_BY_NAME:
         raise ConfigurationError(f"--codec is '{codec}'; use one of {', '.join(CODECS_BY_NAME)}")
     frame_size = parse_size(size)
-    opened = open_source(
-        source,
-        max_frames=frames,
-        ego_csv=ego_csv,
-        size=frame_size,
-        intrinsics=centred_intrinsics(focal, source),
-        fps=fps,
-        mount=camera_mount(camera_height, camera_pitch),
-    )
     config = StreamRunConfig(
         target=target,
         out=out,
@@ -146,7 +140,18 @@ def stream(
         evaluate=evaluate,
         command_line=shlex.join(["cable-rpc", *sys.argv[1:]]),
     )
-    run_and_report(opened, config)
+    with bad_frames_listed(skip_bad) as bad_frames:
+        opened = open_source(
+            source,
+            max_frames=frames,
+            ego_csv=ego_csv,
+            size=frame_size,
+            intrinsics=centred_intrinsics(focal, source, bad_frames),
+            fps=fps,
+            mount=camera_mount(camera_height, camera_pitch),
+            bad_frames=bad_frames,
+        )
+        run_and_report(opened, config)
 
 
 def run_and_report(source: FrameSource, config: StreamRunConfig) -> None:
@@ -188,9 +193,9 @@ def camera_mount(height_m: float | None, pitch_down_deg: float) -> CameraMount |
     return None if height_m is None else CameraMount(height_m, math.radians(pitch_down_deg))
 
 
-def centred_intrinsics(focal: float | None, source: str) -> CameraIntrinsics | None:
+def centred_intrinsics(focal: float | None, source: str, bad_frames: BadFrames) -> CameraIntrinsics | None:
     """A camera with its axis through the middle of the source's own picture."""
     if focal is None:
         return None
-    width, height = open_source(source).size_wh
+    width, height = open_source(source, bad_frames=bad_frames).size_wh
     return CameraIntrinsics(focal, focal, width / 2, height / 2)

@@ -90,6 +90,10 @@ def tables(
     skip_bad: Annotated[
         bool, typer.Option("--skip-bad", help="Leave damaged frames and label rows out, and list them.")
     ] = False,
+    equal_quality: Annotated[
+        bool,
+        typer.Option(help="Code whole frames at six more CRFs, for the bytes saved at equal PSNR inside the region."),
+    ] = True,
 ) -> None:
     """Make the paper's two tables on your data: pixels, true bytes, tokens, prefill, recognition, detection, latency.
 
@@ -127,6 +131,7 @@ def tables(
         size=parse_size(size),
         fps=fps,
         skip_bad=skip_bad,
+        equal_quality=equal_quality,
     )
     cells = run_with_progress(sequence_requests(data), names, settings, out, workers)
     report = TableReport(

@@ -147,9 +147,7 @@ def data_set(package: str, opener: str) -> SourceFactory:
     return open_sequence
 
 
-SOURCES: Mapping[str, SourceFactory] = {
-    "video": open_video,
-    "synthetic": open_synthetic,
+DATA_SETS: Mapping[str, SourceFactory] = {
     "nuscenes": data_set("cable_rpc.data.nuscenes", "open_nuscenes"),
     "waymo": data_set("cable_rpc.data.waymo", "open_waymo"),
     "kitti": data_set("cable_rpc.data.kitti", "open_kitti"),
@@ -157,7 +155,14 @@ SOURCES: Mapping[str, SourceFactory] = {
     "wod_zb": data_set("cable_rpc.data.coco", "open_wod_zb"),
     "coco-video": data_set("cable_rpc.data.coco", "open_coco_video"),
 }
+"""Scheme of a data set to factory; docs/datasets.md describes them."""
+SOURCES: Mapping[str, SourceFactory] = {"video": open_video, "synthetic": open_synthetic, **DATA_SETS}
 """Scheme to factory."""
+SOURCE_FORMS = (
+    "video:FILE, video:FOLDER of images, synthetic:SEED[?route=turns&traffic=none], or a sequence of a data set, "
+    f"SCHEME:ROOT#SEQUENCE with {', '.join(DATA_SETS)} (see docs/datasets.md)"
+)
+"""What can be opened, for help texts."""
 
 
 def open_source(
@@ -193,7 +198,10 @@ def open_source(
     factory = SOURCES.get(scheme)
     if factory is None or not separator or not rest:
         known = ", ".join(f"{name}:..." for name in sorted(SOURCES))
-        hint = f"; for a file write 'video:{spec}'" if Path(spec).exists() else ""
-        raise ConfigurationError(f"can't open source '{spec}': known are {known}{hint}")
+        hint = f"for a file write 'video:{spec}'; " if Path(spec).exists() else ""
+        raise ConfigurationError(
+            f"can't open source '{spec}': known are {known}; {hint}a data set's sequence is SCHEME:ROOT#SEQUENCE, see "
+            "docs/datasets.md"
+        )
     options = SourceOptions(max_frames, ego_csv, size, intrinsics, fps, mount, bad_frames or BadFrames())
     return factory(rest, options)

@@ -21,7 +21,7 @@ from cable_rpc.data.cadc.calibration import read_calibration
 from cable_rpc.data.cadc.novatel import read_novatel
 from cable_rpc.data.cadc.writer import LENS
 from cable_rpc.data.cuboids import cuboid_corners
-from cable_rpc.data.kitti.local_plane import east_north_of
+from cable_rpc.data.local_plane import east_north_of
 from cable_rpc.data.poses import inverse_rigid
 from cable_rpc.data.rendered_drive import DriveFrame, RenderedDrive
 from cable_rpc.data.source import SourceOptions
@@ -223,7 +223,7 @@ def test_options(written: Path) -> None:
         (f"{written}?tree=processed", SourceOptions(), "use tree=labeled or tree=raw"),
         (f"{written}#2018_03_06/0002", SourceOptions(), "no sequence '2018_03_06/0002'; use one of"),
         (f"{written}", SourceOptions(mount=CameraMount(1.5)), "leave ego_csv"),
-        ("#0001", SourceOptions(), "names no folder"),
+        ("#0001", SourceOptions(), "names no file or folder"),
         (f"{written}?tree=raw&tree=raw", SourceOptions(), "give tree once"),
     ):
         with pytest.raises(ConfigurationError, match=message):
@@ -379,7 +379,7 @@ def test_missing_parts(small: Path, tmp_path: Path, caplog: pytest.LogCaptureFix
         (calibration / "extrinsics.yaml", None, r"extrinsics\.yaml.*calib\.zip at http://cadcd"),
         (folder / "3d_ann.json", "[", r"3d_ann\.json line 1"),
         (folder / "3d_ann.json", "{}", "must be a list"),
-        (folder / "3d_ann.json", None, r"can't read annotations .*3d_ann\.json"),
+        (folder / "3d_ann.json", None, r"3d_ann\.json is missing; .*cadcd"),
     ):
         good = file.read_text()
         file.unlink() if text is None else file.write_text(text)

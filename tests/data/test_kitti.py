@@ -19,11 +19,11 @@ from cable_rpc.data.cuboids import cuboid_corners, project_corners
 from cable_rpc.data.kitti import KittiSource, open_kitti, sequences, write_kitti
 from cable_rpc.data.kitti.calibration import read_calibration
 from cable_rpc.data.kitti.labels import ground_truth, label_row
-from cable_rpc.data.kitti.stamps import read_stamps, stamp_ns, stamp_text
 from cable_rpc.data.poses import inverse_rigid
 from cable_rpc.data.rendered_drive import DriveFrame, RenderedDrive
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.data.synthetic import SyntheticConfig
+from cable_rpc.data.time_stamps import read_stamps, stamp_ns, stamp_text
 from cable_rpc.errors import ConfigurationError, SourceError
 from cable_rpc.types import CameraIntrinsics, CameraMount, EgoMotion, Frame
 

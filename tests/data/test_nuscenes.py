@@ -13,7 +13,6 @@ from cable_rpc.data.cuboids import Cuboid
 from cable_rpc.data.nuscenes import open_nuscenes, sequences, write_nuscenes
 from cable_rpc.data.nuscenes.annotations import Annotation, annotations_between
 from cable_rpc.data.nuscenes.categories import class_of_category, is_ignored
-from cable_rpc.data.nuscenes.timing import mean_rate, thinned_evenly
 from cable_rpc.data.poses import rigid
 from cable_rpc.data.rendered_drive import DriveFrame, RenderedDrive
 from cable_rpc.data.source import SourceOptions
@@ -243,16 +242,3 @@ def test_interpolation_by_hand() -> None:
 def test_categories(name: str, class_id: int | None, ignored: bool) -> None:
     assert class_of_category(name) == class_id
     assert is_ignored(name) == ignored
-
-
-def test_uneven_frames_of_12_hz() -> None:
-    """Real cameras wait for the lidar: steps of 100, 50, 100, ... ms are 12 Hz, and thin out evenly."""
-    times = [50_000_000 * round(k * 20 / 12) for k in range(61)]
-    assert mean_rate(times) == pytest.approx(12.0)
-    assert mean_rate([*times, times[-1] + 3_000_000_000]) == pytest.approx(12.0)
-    assert mean_rate(times[:1]) is None
-    kept = thinned_evenly(times, 4.0)
-    assert kept[0] == 0
-    assert len(kept) == 21
-    assert np.abs(np.array([times[place] for place in kept]) - np.arange(21) * 250e6).max() <= 50e6
-    assert thinned_evenly(times, 2.0) == list(range(0, 61, 6))

@@ -181,20 +181,32 @@ def test_versions(copy: Path) -> None:
     assert open_nuscenes(f"{copy}#scene-0001?version=v1.0-trainval", PLAIN).frame_count == 9
     with pytest.raises(ConfigurationError, match=r"no version 'v1\.0-test'"):
         open_nuscenes(f"{copy}#scene-0001?version=v1.0-test", PLAIN)
-    assert sequences(copy) == ["scene-0001", "scene-0002"]
+    with pytest.raises(ConfigurationError, match=r"v1\.0-mini, v1\.0-trainval; .*, or give .*/v1\.0-mini"):
+        sequences(copy)
+
+
+def test_a_versions_own_folder_is_a_root(copy: Path) -> None:
+    shutil.copytree(copy / "v1.0-mini", copy / "v1.0-trainval")
+    edit(copy, "scene", lambda rows: rows[:-1])
+    kept = json.loads((copy / "v1.0-mini" / "scene.json").read_text())
+    assert sequences(copy / "v1.0-mini") == [kept[0]["name"]]
+    assert sequences(copy / "v1.0-trainval") == ["scene-0001", "scene-0002"]
+    assert [frame.index for frame in open_nuscenes(f"{copy}/v1.0-mini", PLAIN)] == list(range(9))
+    with pytest.raises(ConfigurationError, match=r"no version 'v1\.0-mini'"):
+        open_nuscenes(f"{copy}/v1.0-trainval#scene-0001?version=v1.0-mini", PLAIN)
 
 
 @pytest.mark.parametrize(
     ("rest", "message"),
     [
-        ("", "has 2 scenes; add #SCENE, one of 'scene-0001', 'scene-0002'"),
-        ("#scene-0003", "no scene 'scene-0003'; use one of 'scene-0001', 'scene-0002'"),
+        ("", "has 2 sequences; add #SEQUENCE, one of 'scene-0001', 'scene-0002'"),
+        ("#scene-0003", "no sequence 'scene-0003'; use one of 'scene-0001', 'scene-0002'"),
         ("#scene-0001?camera=CAM_BACK", "no camera 'CAM_BACK'; it has CAM_FRONT"),
         ("#scene-0001?boxes=all", "boxes is 'all'; use keyframes or interpolate"),
         ("#scene-0001?ego=imu", "ego is 'imu'; use pose or can"),
         ("#scene-0001?speed=1", "known are version, camera, boxes, ego, frames"),
         ("#scene-0001?ego=can&ego=can", "give ego once"),
-        ("#scene-0001?ego", "write options as key=value"),
+        ("#scene-0001?ego", "write key=value"),
     ],
 )
 def test_wrong_requests(pristine: Path, rest: str, message: str) -> None:
@@ -208,7 +220,7 @@ def test_no_root(tmp_path: Path, pristine: Path) -> None:
         open_nuscenes(f"{tmp_path}/nowhere#scene-0001", PLAIN)
     with pytest.raises(SourceError, match=r"holds no v1\.0-\*/scene\.json"):
         sequences(tmp_path)
-    with pytest.raises(ConfigurationError, match="names no folder"):
+    with pytest.raises(ConfigurationError, match="names no file or folder"):
         open_nuscenes("#scene-0001", PLAIN)
     with pytest.raises(ConfigurationError, match="leave ego_csv, intrinsics and mount out"):
         open_nuscenes(f"{pristine}#scene-0001", SourceOptions(intrinsics=CameraIntrinsics(1.0, 1.0, 0.0, 0.0)))
@@ -243,7 +255,7 @@ def test_damaged_images(copy: Path) -> None:
     files[1].write_bytes(files[1].read_bytes()[:-20])
     files[2].unlink()
     source = open_nuscenes(f"{copy}#scene-0001", PLAIN)
-    with pytest.raises(SourceError, match=f"{files[1].name} is cut off"):
+    with pytest.raises(SourceError, match=f"{files[1].name}: the image is cut off"):
         list(source)
     options = skipping()
     frames = list(open_nuscenes(f"{copy}#scene-0001", options))

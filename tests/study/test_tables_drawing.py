@@ -27,6 +27,7 @@ from cable_rpc.study.sequence_metrics import (
 from cable_rpc.study.tables.cells import Cell
 from cable_rpc.study.tables.draw_csv import draw_csv
 from cable_rpc.study.tables.draw_latex import draw_latex
+from cable_rpc.study.tables.equal_quality import EQUAL_QUALITY_FIGURES
 from cable_rpc.study.tables.paper_values import CROSS_DATA_SET, STRATEGIES
 from cable_rpc.study.tables.report import TableReport
 from cable_rpc.study.tables.settings import RunSettings, SequenceRequest
@@ -102,7 +103,7 @@ def csv_rows(text: str) -> list[dict[str, str]]:
 
 
 def test_every_column_is_filled_by_a_figure_that_exists() -> None:
-    known = {*FIGURES, *AP_FIGURES, *SPECIAL_FIGURES}
+    known = {*FIGURES, *AP_FIGURES, *SPECIAL_FIGURES, *EQUAL_QUALITY_FIGURES}
     for _, measures in (*ACROSS_DATA_SETS, *ACROSS_STRATEGIES):
         for measure in measures:
             assert measure.pooled in known
@@ -254,7 +255,7 @@ def test_the_command_measures_prints_writes_and_tells_of_failure(tmp_path: Path)
     written = {path.name for path in tmp_path.iterdir()}
     assert written == {"cells", "tables.md", "figures.csv", "table1.tex", "table1.csv", "table2.tex", "table2.csv"}
     rows = csv_rows((tmp_path / "figures.csv").read_text())
-    assert {row["figure"] for row in rows} == {*FIGURES, *AP_FIGURES}
+    assert {row["figure"] for row in rows} == {*FIGURES, *AP_FIGURES, *EQUAL_QUALITY_FIGURES}
     failed = CliRunner().invoke(app, [*arguments, "--data", "video:nowhere.mp4"], catch_exceptions=False)
     assert failed.exit_code == 1
     assert "nowhere.mp4" in failed.output

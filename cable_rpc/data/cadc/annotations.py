@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
@@ -13,8 +12,9 @@ import numpy as np
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.cadc.calibration import CadcCalibration
 from cable_rpc.data.cadc.layout import WEBSITE
-from cable_rpc.data.coco.fields import JsonRow, number, shown, text
 from cable_rpc.data.cuboids import Cuboid, cuboid_corners, project_corners
+from cable_rpc.data.json_fields import JsonRow, number, shown, text
+from cable_rpc.data.json_file import read_json
 from cable_rpc.errors import SourceError
 from cable_rpc.types import GroundTruth
 
@@ -66,15 +66,9 @@ def read_frames(path: Path) -> list[Any]:
     Raises:
         SourceError: the file is missing or holds something else.
     """
-    try:
-        with path.open("rb") as file:
-            frames = json.load(file)
-    except OSError as error:
-        raise SourceError(f"can't read annotations {path}: {error.strerror}; they are at {WEBSITE}") from error
-    except json.JSONDecodeError as error:
-        raise SourceError(f"{path} line {error.lineno}, column {error.colno} is not JSON: {error.msg}") from error
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise SourceError(f"{path} is not JSON: {error}") from error
+    if not path.exists():
+        raise SourceError(f"{path} is missing; it is part of the annotations at {WEBSITE}")
+    frames = read_json(path, "annotations")
     if not isinstance(frames, list):
         raise SourceError(f"{path} holds {shown(frames)}; it must be a list with one entry per annotated frame")
     return frames

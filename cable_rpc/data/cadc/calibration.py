@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.cadc.layout import WEBSITE
-from cable_rpc.data.coco.fields import JsonRow, is_finite, shown
+from cable_rpc.data.json_fields import JsonRow, is_finite, shown
 from cable_rpc.data.poses import inverse_rigid
 from cable_rpc.errors import ConfigurationError, SourceError
 from cable_rpc.types import CameraIntrinsics

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.kitti.local_plane import east_north_of
-from cable_rpc.data.kitti.stamps import read_stamps
+from cable_rpc.data.local_plane import east_north_of
 from cable_rpc.data.poses import LEAST_POSES, NS_PER_S, motion_from_poses, rigid
+from cable_rpc.data.text_fields import finite_number
+from cable_rpc.data.time_stamps import read_stamps
 from cable_rpc.errors import SourceError
 from cable_rpc.types import EgoMotion
 
@@ -107,15 +108,7 @@ def read_message(file: Path, time_ns: int) -> NovatelMessage:
     columns = [LATITUDE, LONGITUDE, AZIMUTH]
     moving = len(words) > EAST_VELOCITY
     columns += [NORTH_VELOCITY, EAST_VELOCITY] if moving else []
-    values: list[float] = []
-    for column in columns:
-        try:
-            value = float(words[column])
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise SourceError(f"{file} line 1, value {column + 1}: '{words[column]}' is not a finite number")
-        values.append(value)
+    values = [finite_number(words[column], f"value {column + 1}", f"{file} line 1") for column in columns]
     velocity = (values[3], values[4]) if moving else None
     return NovatelMessage(time_ns, values[0], values[1], values[2], velocity)
 

@@ -14,13 +14,13 @@ from cable_rpc.data.cadc.calibration import read_calibration
 from cable_rpc.data.cadc.layout import LABELLED_TREES, TREES, DrivePaths, drive_paths, find_drives
 from cable_rpc.data.cadc.novatel import read_novatel
 from cable_rpc.data.cadc.source import CadcDrive, CadcSource
-from cable_rpc.data.coco.images import safe_name
 from cable_rpc.data.cuboids import Cuboid
-from cable_rpc.data.kitti.numbered import NumberedImage, list_images
-from cable_rpc.data.kitti.spec import choose_sequence, parse_folder_spec
-from cable_rpc.data.kitti.stamps import read_stamps
+from cable_rpc.data.names import safe_name
+from cable_rpc.data.numbered_images import NumberedImage, list_images
+from cable_rpc.data.sequence_spec import choose_sequence, parse_sequence_spec
 from cable_rpc.data.source import SourceOptions
-from cable_rpc.errors import ConfigurationError, SourceError
+from cable_rpc.data.time_stamps import read_stamps, read_stamps_by_number
+from cable_rpc.errors import ConfigurationError
 from cable_rpc.types import CameraMount
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ def open_cadc(rest: str, options: SourceOptions) -> CadcSource:
         ConfigurationError: an option can't be used, or the drive isn't told and there are several.
         SourceError: images, calibration or annotations can't be read.
     """
-    spec = parse_folder_spec("cadc", rest, ("tree",))
+    spec = parse_sequence_spec("cadc", rest, ("tree",))
     tree = spec.values.get("tree")
     if tree is not None and tree not in TREES:
         raise ConfigurationError(f"'{spec.spec}': tree is '{tree}'; known are {', '.join(TREES)}")
@@ -90,14 +90,7 @@ def capture_times(paths: DrivePaths) -> Callable[[int], int]:
         fps = RAW_FPS if paths.distorted else LABELLED_FPS
         log.warning("%s is not there; frames are taken to come at %.3g per second", paths.stamps, fps)
         return lambda number: round(number * NS_PER_S / fps)
-    stamps = read_stamps(paths.stamps)
-
-    def stamp_of(number: int) -> int:
-        if number >= len(stamps):
-            raise SourceError(f"{paths.stamps} has {len(stamps)} lines, none for image {number}")
-        return stamps[number]
-
-    return stamp_of
+    return read_stamps_by_number(paths.stamps)
 
 
 def annotations_of(paths: DrivePaths, bad_frames: BadFrames) -> list[list[Cuboid]]:

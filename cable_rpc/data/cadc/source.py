@@ -9,7 +9,7 @@ from cable_rpc.data.cadc.annotations import ground_truth
 from cable_rpc.data.cadc.calibration import CadcCalibration
 from cable_rpc.data.cadc.novatel import NovatelLog
 from cable_rpc.data.cuboids import Cuboid
-from cable_rpc.data.kitti.numbered import NumberedImage, NumberedImages
+from cable_rpc.data.numbered_images import NumberedImage, NumberedImages
 from cable_rpc.data.resize import resize_frame, scaled_intrinsics
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.errors import SourceError

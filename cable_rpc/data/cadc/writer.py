@@ -21,7 +21,7 @@ from cable_rpc.data.cadc.written_rows import (
     novatel_line,
     sensor_poses,
 )
-from cable_rpc.data.kitti.stamps import stamp_ns, stamp_text
+from cable_rpc.data.time_stamps import stamp_ns, stamp_text
 from cable_rpc.errors import SourceError
 from cable_rpc.types import CameraIntrinsics, Image
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.cuboids import Cuboid
-from cable_rpc.data.kitti.local_plane import geodetic_of
+from cable_rpc.data.local_plane import geodetic_of
 from cable_rpc.data.poses import inverse_rigid, rigid, yaw_of
 from cable_rpc.types import CameraIntrinsics, EgoMotion
 

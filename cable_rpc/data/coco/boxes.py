@@ -10,8 +10,8 @@ import numpy as np
 
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.coco.categories import class_of_category, is_unannotated
-from cable_rpc.data.coco.fields import Identifier, JsonRow, identifier, number, numbers, shown
 from cable_rpc.data.coco.tables import CocoTables
+from cable_rpc.data.json_fields import Identifier, JsonRow, identifier, number, numbers, shown
 from cable_rpc.errors import SourceError
 from cable_rpc.types import GroundTruth
 

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from cable_rpc.data.coco.fields import Identifier, JsonRow, identifier, is_finite, number, numbers, shown, side_px, text
 from cable_rpc.data.coco.tables import CocoTables
+from cable_rpc.data.json_fields import Identifier, JsonRow, identifier, is_finite, number, numbers, shown, side_px, text
 from cable_rpc.errors import SourceError
 from cable_rpc.types import CameraIntrinsics, CameraMount, EgoMotion
 
@@ -157,8 +157,3 @@ def camera_mount(row: JsonRow, place: str) -> CameraMount | None:
 def natural_key(name: str) -> list[str | int]:
     """Sorts ``img10`` after ``img9``."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
-
-
-def safe_name(sequence: str) -> str:
-    """A sequence's name as a part of file names."""
-    return re.sub(r"[^\w.+-]+", "-", sequence).strip("-.") or "sequence"

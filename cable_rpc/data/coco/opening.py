@@ -3,33 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from urllib.parse import unquote
 
 from cable_rpc.data.coco.images import natural_key, sequence_names
 from cable_rpc.data.coco.source import CocoSource, CocoView, read_sequence
 from cable_rpc.data.coco.tables import CocoTables, read_tables
 from cable_rpc.data.ego_csv import read_ego_csv
+from cable_rpc.data.names import listed
+from cable_rpc.data.sequence_spec import SequenceSpec, parse_sequence_spec
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.errors import ConfigurationError, SourceError
 
 DEFAULT_FPS = 10.0
-LISTED_SEQUENCES = 10
 OPTION_KEYS = ("images", "sequence", "fps")
-
-
-@dataclass(frozen=True, slots=True)
-class CocoSpec:
-    """A spec taken apart: ``PATH#SEQUENCE?images=FOLDER&fps=RATE``."""
-
-    spec: str
-    """As written, for error texts."""
-    path: Path
-    sequence: str | None
-    images: Path | None
-    fps: float | None
-    """Rate of the frame numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +57,14 @@ def sequences(root: Path) -> list[str]:
     return sorted(names, key=natural_key)
 
 
-def open_spec(spec: CocoSpec, options: SourceOptions) -> CocoSource:
+def open_spec(spec: SequenceSpec, options: SourceOptions) -> CocoSource:
     """Find the sequence and open it."""
+    number_fps = stated_number_fps(spec)
     found = find_sequence(spec)
-    sequence = read_sequence(found.tables, found.name, spec.fps or stated_fps(found) or DEFAULT_FPS, options.bad_frames)
-    folder = image_folder(spec, found.tables.path, sequence.images[0].file_name)
+    sequence = read_sequence(
+        found.tables, found.name, number_fps or stated_fps(found) or DEFAULT_FPS, options.bad_frames
+    )
+    folder = image_folder(spec.values.get("images"), found.tables.path, sequence.images[0].file_name)
     ego = None if options.ego_csv is None else read_ego_csv(options.ego_csv)
     view = CocoView(
         options.size, options.fps, options.max_frames, ego, options.intrinsics, options.mount, options.bad_frames
@@ -82,35 +72,33 @@ def open_spec(spec: CocoSpec, options: SourceOptions) -> CocoSource:
     return CocoSource(sequence, folder, view)
 
 
-def parse_spec(scheme: str, rest: str) -> CocoSpec:
-    """Take a spec apart.
+def parse_spec(scheme: str, rest: str) -> SequenceSpec:
+    """Take a spec apart; the sequence may stand among the options.
 
     Raises:
-        ConfigurationError: an option is unknown, comes twice or can't be used.
+        ConfigurationError: an option is unknown, comes twice or has no value.
     """
-    spec = f"{scheme}:{rest}"
-    head, _, query = rest.partition("?")
-    path, _, sequence = head.partition("#")
-    values: dict[str, str] = {}
-    for pair in query.split("&") if query else []:
-        key, separator, value = pair.partition("=")
-        if key not in OPTION_KEYS or not separator or not value:
-            raise ConfigurationError(
-                f"'{spec}': write options as key=value, joined by &; known are {', '.join(OPTION_KEYS)}"
-            )
-        if key in values or (key == "sequence" and sequence):
-            raise ConfigurationError(f"'{spec}': give {key} once")
-        values[key] = unquote(value)
-    fps = None
-    if "fps" in values:
-        try:
-            fps = float(values["fps"])
-        except ValueError:
-            fps = 0.0
-        if not 0 < fps < 1e6:
-            raise ConfigurationError(f"'{spec}': fps is '{values['fps']}'; give a positive frame rate")
-    images = Path(values["images"]) if "images" in values else None
-    return CocoSpec(spec, Path(path), sequence or values.get("sequence"), images, fps)
+    spec = parse_sequence_spec(scheme, rest, OPTION_KEYS)
+    if spec.sequence is not None and "sequence" in spec.values:
+        raise ConfigurationError(f"'{spec.spec}': give sequence once")
+    return replace(spec, sequence=spec.sequence or spec.values.get("sequence"))
+
+
+def stated_number_fps(spec: SequenceSpec) -> float | None:
+    """The rate of the frame numbers that a spec states, where it does.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    if "fps" not in spec.values:
+        return None
+    try:
+        fps = float(spec.values["fps"])
+    except ValueError:
+        fps = 0.0
+    if not 0 < fps < 1e6:
+        raise ConfigurationError(f"'{spec.spec}': fps is '{spec.values['fps']}'; give a positive frame rate")
+    return fps
 
 
 def annotation_files(root: Path) -> list[Path]:
@@ -132,7 +120,7 @@ def annotation_files(root: Path) -> list[Path]:
     return files
 
 
-def find_sequence(spec: CocoSpec) -> Found:
+def find_sequence(spec: SequenceSpec) -> Found:
     """The sequence that is asked for, or the only one; one file is held at a time.
 
     Raises:
@@ -141,7 +129,7 @@ def find_sequence(spec: CocoSpec) -> Found:
     """
     found: Found | None = None
     names: list[str] = []
-    for file in annotation_files(spec.path):
+    for file in annotation_files(spec.root):
         tables = read_tables(file)
         here = sequence_names(tables)
         names += here
@@ -161,12 +149,6 @@ def find_sequence(spec: CocoSpec) -> Found:
     return found
 
 
-def listed(names: Sequence[str]) -> str:
-    """Some names for an error text."""
-    text = "one of " + ", ".join(f"'{name}'" for name in names[:LISTED_SEQUENCES])
-    return text if len(names) <= LISTED_SEQUENCES else f"{text} and {len(names) - LISTED_SEQUENCES} more"
-
-
 def stated_fps(found: Found) -> float | None:
     """The rate that the sequence's row among the videos states, where it has one."""
     for video_id, row in found.tables.videos.items():
@@ -176,20 +158,20 @@ def stated_fps(found: Found) -> float | None:
     return None
 
 
-def image_folder(spec: CocoSpec, annotation_file: Path, file_name: str) -> Path:
+def image_folder(stated: str | None, annotation_file: Path, file_name: str) -> Path:
     """The folder in which a file name is found: the one given, else the first of the usual ones.
 
     Raises:
         SourceError: it is in none of them.
     """
     beside = annotation_file.parent
-    usual = (beside, beside / "images", beside.parent, beside.parent / "images")
-    folders = usual if spec.images is None else (spec.images,)
+    usual: Sequence[Path] = (beside, beside / "images", beside.parent, beside.parent / "images")
+    folders = usual if stated is None else (Path(stated),)
     for folder in folders:
         if (folder / file_name).exists():
             return folder
-    if spec.images is not None and spec.images.is_dir():
-        return spec.images
+    if stated is not None and Path(stated).is_dir():
+        return Path(stated)
     tried = ", ".join(str(folder) for folder in folders)
     raise SourceError(
         f"{annotation_file} names {file_name}, which is in none of {tried}; give the folder as ?images=FOLDER"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.coco.fields import Identifier, shown
 from cable_rpc.data.coco.images import NS_PER_S, ImageRow, image_row, natural_key, sequence_of
 from cable_rpc.data.coco.tables import CocoTables
+from cable_rpc.data.json_fields import Identifier, shown
 from cable_rpc.errors import SourceError
 
 

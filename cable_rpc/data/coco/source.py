@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
 
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.coco.boxes import BoxRow, TrackKey, ground_truth, number_tracks, read_boxes
-from cable_rpc.data.coco.fields import Identifier
-from cable_rpc.data.coco.image_file import read_whole_image
-from cable_rpc.data.coco.images import NS_PER_S, ImageRow, safe_name
+from cable_rpc.data.coco.images import NS_PER_S, ImageRow
 from cable_rpc.data.coco.order import read_images, times_ns
 from cable_rpc.data.coco.tables import CocoTables
 from cable_rpc.data.ego_csv import EgoLog
+from cable_rpc.data.frame_rate import nominal_fps, thinned
+from cable_rpc.data.image_file import read_whole_image
+from cable_rpc.data.json_fields import Identifier
+from cable_rpc.data.names import safe_name
 from cable_rpc.data.resize import resize_frame
 from cable_rpc.errors import SourceError
 from cable_rpc.types import CameraIntrinsics, CameraMount, EgoMotion, Frame, GroundTruth
-
-THINNING_SLACK = 1e-3
-"""Of a period, absorbs rounded time stamps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,24 +162,3 @@ def read_sequence(tables: CocoTables, name: str, fps: float, bad_frames: BadFram
     if tables.annotations is not None:
         boxes = read_boxes(tables, {image.image_id for image in images}, bad_frames)
     return CocoSequence(name, images, times_ns(images, fps), boxes, number_tracks(boxes or {}))
-
-
-def nominal_fps(times: Sequence[int]) -> float | None:
-    """Frames per second by the median distance of the times; None for a single frame."""
-    if len(times) < 2:
-        return None
-    return NS_PER_S / median(later - earlier for earlier, later in itertools.pairwise(times))
-
-
-def thinned(times: Sequence[int], fps: float | None) -> list[int]:
-    """Places of the frames that are the first of their period; all where ``fps`` is None."""
-    if fps is None:
-        return list(range(len(times)))
-    kept: list[int] = []
-    slot = -1
-    for place, time in enumerate(times):
-        due = math.floor((time - times[0]) * fps / NS_PER_S + THINNING_SLACK)
-        if due > slot:
-            kept.append(place)
-            slot = due
-    return kept

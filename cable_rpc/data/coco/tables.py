@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cable_rpc.data.coco.fields import Identifier, JsonRow, identifier, shown, text
+from cable_rpc.data.json_fields import Identifier, JsonRow, identifier, shown, text
+from cable_rpc.data.json_file import read_json
 from cable_rpc.errors import SourceError
 
 UNREAD_KEYS = ("segmentation", "caption", "keypoints", "counts")
@@ -37,15 +37,7 @@ def read_tables(path: Path) -> CocoTables:
     Raises:
         SourceError: it can't be read, isn't JSON, or lacks the tables of the format.
     """
-    try:
-        with path.open("rb") as file:
-            document = json.load(file, object_hook=without_unread)
-    except OSError as error:
-        raise SourceError(f"can't read annotation file {path}: {error.strerror}") from error
-    except json.JSONDecodeError as error:
-        raise SourceError(f"{path} line {error.lineno}, column {error.colno} is not JSON: {error.msg}") from error
-    except (UnicodeDecodeError, RecursionError) as error:
-        raise SourceError(f"{path} is not JSON: {error}") from error
+    document = read_json(path, "annotation file", without_unread)
     if not isinstance(document, dict):
         raise SourceError(f"{path} holds {shown(document)}; COCO's format is an object with 'images'")
     annotations = table(path, document, "annotations") if "annotations" in document else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.kitti.layout import WEBSITE
+from cable_rpc.data.text_fields import finite_number, whole_number
 from cable_rpc.errors import SourceError
 from cable_rpc.types import GroundTruth
 
@@ -33,7 +33,6 @@ VISIBILITY_BY_LEVEL: Mapping[str, float] = {"0": 1.0, "1": 0.7, "2": 0.4, "3": 0
 The levels were never given numbers; "largely" is below the half that quality figures ask for, "partly" above.
 """
 FEWEST_COLUMNS = 17
-LARGEST_ID = 2**31 - 1
 
 BOX_COLUMNS = ("left", "top", "right", "bottom")
 
@@ -94,7 +93,9 @@ def label_row(words: Sequence[str], place: str) -> tuple[int, LabelRow | None]:
     if kind != UNANNOTATED_TYPE and kind not in CLASS_BY_TYPE:
         known = ", ".join((*CLASS_BY_TYPE, *sorted(LEFT_OUT_TYPES), UNANNOTATED_TYPE))
         raise SourceError(f"{place}: type is '{kind}'; known are {known}")
-    left, top, right, bottom = (finite(word, name, place) for name, word in zip(BOX_COLUMNS, words[6:10], strict=True))
+    left, top, right, bottom = (
+        finite_number(word, name, place) for name, word in zip(BOX_COLUMNS, words[6:10], strict=True)
+    )
     if right <= left or bottom <= top:
         raise SourceError(f"{place}: the box {left:g}, {top:g}, {right:g}, {bottom:g} has no area")
     if kind == UNANNOTATED_TYPE:
@@ -102,32 +103,6 @@ def label_row(words: Sequence[str], place: str) -> tuple[int, LabelRow | None]:
     visibility = min(visible_share(words[3], "truncated", place), visible_share(words[4], "occluded", place))
     track_id = whole_number(words[1], "track_id", place)
     return frame, LabelRow((left, top, right, bottom), CLASS_BY_TYPE[kind], track_id, visibility)
-
-
-def whole_number(word: str, column: str, place: str) -> int:
-    """A whole number of at least 0.
-
-    Raises:
-        SourceError: it is none.
-    """
-    if not (word.isascii() and word.isdecimal()) or int(word) > LARGEST_ID:
-        raise SourceError(f"{place}: {column} is '{word}'; it must be a whole number, 0 or more")
-    return int(word)
-
-
-def finite(word: str, column: str, place: str) -> float:
-    """A finite number.
-
-    Raises:
-        SourceError: it is none.
-    """
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise SourceError(f"{place}: {column} is '{word}'; it must be a finite number")
-    return value
 
 
 def visible_share(word: str, column: str, place: str) -> float:
@@ -140,7 +115,7 @@ def visible_share(word: str, column: str, place: str) -> float:
     """
     if word in VISIBILITY_BY_LEVEL:
         return VISIBILITY_BY_LEVEL[word]
-    hidden = finite(word, column, place)
+    hidden = finite_number(word, column, place)
     if "." not in word or not 0.0 <= hidden <= 1.0:
         raise SourceError(f"{place}: {column} is '{word}'; it must be a level 0, 1, 2, 3 or a share 0.0..1.0")
     return 1.0 - hidden

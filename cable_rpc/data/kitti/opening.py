@@ -7,18 +7,18 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.coco.images import safe_name
 from cable_rpc.data.ego_csv import EgoLog, read_ego_csv
 from cable_rpc.data.kitti.calibration import read_calibration
 from cable_rpc.data.kitti.labels import LabelRow, read_labels
 from cable_rpc.data.kitti.layout import SequencePaths, find_sequences
-from cable_rpc.data.kitti.numbered import NumberedImage, list_images
 from cable_rpc.data.kitti.oxts import read_oxts
 from cable_rpc.data.kitti.source import KittiSequence, KittiSource
-from cable_rpc.data.kitti.spec import choose_sequence, parse_folder_spec
-from cable_rpc.data.kitti.stamps import read_stamps
+from cable_rpc.data.names import safe_name
+from cable_rpc.data.numbered_images import NumberedImage, list_images
+from cable_rpc.data.sequence_spec import choose_sequence, parse_sequence_spec
 from cable_rpc.data.source import SourceOptions
-from cable_rpc.errors import ConfigurationError, SourceError
+from cable_rpc.data.time_stamps import read_stamps_by_number
+from cable_rpc.errors import ConfigurationError
 from cable_rpc.types import EgoMotion
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,7 @@ def open_kitti(rest: str, options: SourceOptions) -> KittiSource:
         ConfigurationError: an option can't be used, or the sequence isn't told and there are several.
         SourceError: images, calibration or labels can't be read.
     """
-    spec = parse_folder_spec("kitti", rest)
+    spec = parse_sequence_spec("kitti", rest)
     if options.intrinsics is not None or options.mount is not None:
         raise ConfigurationError(f"'{spec.spec}': KITTI is calibrated; leave intrinsics and mount out")
     found = find_sequences(spec.root)
@@ -74,14 +74,7 @@ def capture_times(paths: SequencePaths) -> Callable[[int], int]:
     """
     if not paths.stamps.exists():
         return lambda number: number * FRAME_PERIOD_NS
-    stamps = read_stamps(paths.stamps)
-
-    def stamp_of(number: int) -> int:
-        if number >= len(stamps):
-            raise SourceError(f"{paths.stamps} has {len(stamps)} lines, none for image {number}")
-        return stamps[number]
-
-    return stamp_of
+    return read_stamps_by_number(paths.stamps)
 
 
 def labels_of(paths: SequencePaths, bad_frames: BadFrames) -> Mapping[int, Sequence[LabelRow]] | None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from cable_rpc.data.bad_frames import BadFrames
+from cable_rpc.data.text_fields import finite_number
 from cable_rpc.errors import SourceError
 from cable_rpc.types import EgoMotion
 
@@ -46,14 +46,6 @@ def motion_of(words: Sequence[str], place: str) -> EgoMotion:
     """
     if len(words) != COLUMNS:
         raise SourceError(f"{place}: {len(words)} values; a line of the GPS/IMU record has {COLUMNS}")
-    values: list[float] = []
-    for column in (VELOCITY_FORWARD, VELOCITY_LEFT, YAW_RATE_UP):
-        try:
-            value = float(words[column])
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise SourceError(f"{place}, value {column + 1}: '{words[column]}' is not a finite number")
-        values.append(value)
-    forward, left, yaw_rate = values
+    columns = (VELOCITY_FORWARD, VELOCITY_LEFT, YAW_RATE_UP)
+    forward, left, yaw_rate = (finite_number(words[column], f"value {column + 1}", place) for column in columns)
     return EgoMotion(forward, -left, yaw_rate)

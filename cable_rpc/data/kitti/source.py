@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from cable_rpc.data.ego_csv import EgoLog
 from cable_rpc.data.kitti.calibration import KittiCalibration
 from cable_rpc.data.kitti.labels import LabelRow, ground_truth
-from cable_rpc.data.kitti.numbered import NumberedImage, NumberedImages
+from cable_rpc.data.numbered_images import NumberedImage, NumberedImages
 from cable_rpc.data.resize import resize_frame, scaled_intrinsics
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.types import EgoMotion, Frame

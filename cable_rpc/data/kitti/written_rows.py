@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from cable_rpc.data.cuboids import Cuboid, cuboid_corners, project_corners
 from cable_rpc.data.kitti.labels import VISIBILITY_BY_LEVEL
-from cable_rpc.data.kitti.local_plane import geodetic_of
+from cable_rpc.data.local_plane import geodetic_of
 from cable_rpc.data.poses import inverse_rigid, rigid, yaw_of
 from cable_rpc.types import CameraIntrinsics, EgoMotion
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.coco.fields import numbers, shown
 from cable_rpc.data.cuboids import Cuboid
+from cable_rpc.data.json_fields import numbers, shown
 from cable_rpc.data.nuscenes.categories import class_of_category, is_ignored
 from cable_rpc.data.nuscenes.selection import rows_where
 from cable_rpc.data.nuscenes.tables import TableRow, names_by_token, read_rows

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.coco.fields import numbers
+from cable_rpc.data.json_fields import numbers
 from cable_rpc.data.nuscenes.tables import SITE, TableRow, read_rows, time_of
 from cable_rpc.errors import SourceError
 from cable_rpc.types import EgoMotion

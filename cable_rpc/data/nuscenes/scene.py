@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.coco.fields import numbers, shown, side_px, text
+from cable_rpc.data.json_fields import numbers, shown, side_px, text
 from cable_rpc.data.nuscenes.annotations import Annotation, read_annotations
 from cable_rpc.data.nuscenes.selection import rows_where
 from cable_rpc.data.nuscenes.tables import TableRow, names_by_token, read_rows, time_of

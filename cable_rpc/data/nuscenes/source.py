@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.coco.image_file import read_whole_image
-from cable_rpc.data.coco.images import safe_name
+from cable_rpc.data.frame_rate import nominal_fps, thinned
+from cable_rpc.data.image_file import read_whole_image
+from cable_rpc.data.names import safe_name
 from cable_rpc.data.nuscenes.can_bus import CanMotion
 from cable_rpc.data.nuscenes.scene import CameraImage, Scene
-from cable_rpc.data.nuscenes.timing import mean_rate, thinned_evenly
 from cable_rpc.data.nuscenes.truth import truth_of
 from cable_rpc.data.poses import LEAST_POSES, motion_from_poses
 from cable_rpc.data.resize import resize_frame
@@ -70,9 +70,9 @@ class NuScenesSource:
         if not places:
             raise SourceError(f"scene '{scene.name}' has no keyframe of {view.camera}")
         times = [scene.images[place].time_ns for place in places]
-        rate = mean_rate(times)
+        rate = nominal_fps(times)
         if view.fps is not None and rate is not None and view.fps < rate:
-            places, rate = [places[kept] for kept in thinned_evenly(times, view.fps)], view.fps
+            places, rate = [places[kept] for kept in thinned(times, view.fps)], view.fps
         self.fps = rate or view.fps or LONE_FRAME_FPS
         self._chosen = places[: view.max_frames]
         self.size_wh = scene.images[0].size_wh if view.size is None else view.size

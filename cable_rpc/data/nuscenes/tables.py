@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cable_rpc.data.coco.fields import JsonRow, number, shown, text
+from cable_rpc.data.json_fields import JsonRow, number, shown, text
 from cable_rpc.errors import ConfigurationError, SourceError
 
 SITE = "https://www.nuscenes.org/nuscenes#download"
@@ -153,13 +153,22 @@ def find_versions(root: Path) -> list[str]:
 def tables_folder(root: Path, version: str | None) -> Path:
     """The folder of tables of a version, or of the only one.
 
+    Args:
+        root: of the data set, or the folder of tables itself, which lies in that.
+        version: name of the folder of tables.
+
     Raises:
         ConfigurationError: no such version, or several and none is told.
         SourceError: there are none at all.
     """
-    versions = find_versions(root)
+    if (root / "scene.json").is_file():
+        root, versions = root.absolute().parent, [root.absolute().name]
+    else:
+        versions = find_versions(root)
     if version is None and len(versions) > 1:
-        raise ConfigurationError(f"{root} holds the versions {', '.join(versions)}; add ?version={versions[0]}")
+        raise ConfigurationError(
+            f"{root} holds the versions {', '.join(versions)}; add ?version={versions[0]}, or give {root / versions[0]}"
+        )
     if version is not None and version not in versions:
         raise ConfigurationError(f"{root} has no version '{version}'; it holds {', '.join(versions)}")
     return root / (version or versions[0])

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from cable_rpc.data.poses import motion_from_poses
-from cable_rpc.data.waymo.camera import INTRINSIC_NAMES, Calibration, CameraName, pose_matrix, read_calibration
+from cable_rpc.data.bad_frames import BadFrames
+from cable_rpc.data.waymo.camera import INTRINSIC_NAMES, Calibration, CameraName, read_calibration
 from cable_rpc.data.waymo.labels import BoxLabel
+from cable_rpc.data.waymo.motion import FloatArray, motion_of_poses, pose_matrix
 from cable_rpc.data.waymo.segment import NS_PER_MICROSECOND, WEBSITE
 from cable_rpc.data.waymo.tables import read_columns
 from cable_rpc.errors import SourceError
@@ -42,8 +41,6 @@ TYPE_COLUMN = "[CameraBoxComponent].type"
 DIFFICULTY_COLUMN = "[CameraBoxComponent].difficulty_level.detection"
 
 VEHICLE_POSE_COLUMN = "[VehiclePoseComponent].world_from_vehicle.transform"
-
-LEAST_POSES = 2
 
 
 def component_path(folder: Path, component: str, segment: str) -> Path:
@@ -83,54 +80,74 @@ def read_camera_calibration(path: Path, camera: CameraName) -> Calibration:
     raise SourceError(f"{path} has no row of camera {camera.name}; found {', '.join(map(str, columns[CAMERA_KEY]))}")
 
 
-def read_boxes(path: Path, camera: CameraName) -> dict[int, list[BoxLabel]]:
-    """One camera's rows of a ``camera_box`` table by the frame's time stamp in microseconds.
+def read_boxes(path: Path, camera: CameraName, bad_frames: BadFrames) -> dict[int, list[BoxLabel]]:
+    """One camera's rows of a ``camera_box`` table by the frame's time in ns.
 
     Raises:
-        SourceError: the table can't be read.
+        SourceError: the table can't be read; or a row has no time stamp, unless that is to be skipped.
     """
     keys = [TIME_KEY, CAMERA_KEY, OBJECT_KEY]
     columns = read_columns(path, [*keys, *CENTRE_COLUMNS, *BOX_SIZE_COLUMNS, TYPE_COLUMN], [DIFFICULTY_COLUMN])
     (centre_x, centre_y), (size_x, size_y) = CENTRE_COLUMNS, BOX_SIZE_COLUMNS
     boxes: dict[int, list[BoxLabel]] = defaultdict(list)
     for row, name in enumerate(columns[CAMERA_KEY]):
-        if is_camera(name, camera):
-            boxes[columns[TIME_KEY][row]].append(
-                BoxLabel(
-                    f"{path} row {row + 1}",
-                    columns[OBJECT_KEY][row],
-                    columns[TYPE_COLUMN][row],
-                    (columns[centre_x][row], columns[centre_y][row]),
-                    (columns[size_x][row], columns[size_y][row]),
-                    columns[DIFFICULTY_COLUMN][row],
-                )
+        if not is_camera(name, camera):
+            continue
+        place = f"{path} row {row + 1}"
+        try:
+            time_ns = time_ns_of(columns[TIME_KEY][row], place)
+        except SourceError as error:
+            bad_frames.found(error)
+            continue
+        boxes[time_ns].append(
+            BoxLabel(
+                place,
+                columns[OBJECT_KEY][row],
+                columns[TYPE_COLUMN][row],
+                (columns[centre_x][row], columns[centre_y][row]),
+                (columns[size_x][row], columns[size_y][row]),
+                columns[DIFFICULTY_COLUMN][row],
             )
+        )
     return dict(boxes)
 
 
-def read_motion(path: Path) -> dict[int, EgoMotion | None]:
-    """Ego-motion from the differences of a ``vehicle_pose`` table, by the time stamp in microseconds.
+def read_motion(path: Path, bad_frames: BadFrames) -> dict[int, EgoMotion | None]:
+    """Ego-motion from the differences of a ``vehicle_pose`` table, by the time in ns.
 
     Returns:
         None in place of the motion where there is but one pose.
 
     Raises:
-        SourceError: the table can't be read, or a pose can't be used.
+        SourceError: the table can't be read; or a row is damaged, unless that is to be skipped.
     """
     columns = read_columns(path, [TIME_KEY, VEHICLE_POSE_COLUMN])
-    poses = {
-        time: pose_matrix(columns[VEHICLE_POSE_COLUMN][row], f"{path} row {row + 1}: the pose")
-        for row, time in enumerate(columns[TIME_KEY])
-    }
-    times = sorted(poses)
-    if len(times) < LEAST_POSES:
-        return dict.fromkeys(times)
-    times_ns = np.array(times, np.int64) * NS_PER_MICROSECOND
-    motion = motion_from_poses(times_ns, np.stack([poses[time] for time in times]))
-    return dict(zip(times, motion, strict=True))
+    poses: dict[int, FloatArray] = {}
+    for row, (micros, values) in enumerate(zip(columns[TIME_KEY], columns[VEHICLE_POSE_COLUMN], strict=True)):
+        place = f"{path} row {row + 1}"
+        try:
+            poses[time_ns_of(micros, place)] = pose_matrix(values, f"{place}: the pose")
+        except SourceError as error:
+            bad_frames.found(error)
+    return motion_of_poses(poses)
 
 
-def velocity_of(values: Sequence[Any]) -> list[float] | None:
-    """Three stored numbers; None where one is missing."""
-    numbers = [float(value) for value in values if value is not None and not math.isnan(value)]
-    return numbers if len(numbers) == len(values) else None
+def time_ns_of(micros: Any, place: str) -> int:
+    """The time in ns of a row's key.
+
+    Raises:
+        SourceError: it is missing.
+    """
+    if not isinstance(micros, int):
+        raise SourceError(f"{place}: {TIME_KEY} is {micros}; it must be a whole number of microseconds")
+    return micros * NS_PER_MICROSECOND
+
+
+def stored_motion(values: Mapping[str, Any]) -> tuple[list[float], list[float], list[Any]] | None:
+    """Velocity (m/s), turn (rad/s) and pose of a ``camera_image`` row; None where one is missing."""
+    velocity = [values.get(name, math.nan) for name in VELOCITY_COLUMNS]
+    turn = [values.get(name, math.nan) for name in TURN_COLUMNS]
+    pose: list[Any] | None = values.get(IMAGE_POSE_COLUMN)
+    if pose is None or any(value is None or math.isnan(value) for value in [*velocity, *turn]):
+        return None
+    return velocity, turn, pose

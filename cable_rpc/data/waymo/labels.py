@@ -14,7 +14,8 @@ from cable_rpc.errors import SourceError
 from cable_rpc.types import GroundTruth
 
 CLASS_BY_TYPE: Mapping[int, int | None] = {0: None, 1: 2, 2: 0, 3: None, 4: 1}
-"""Label.Type (unknown, vehicle, pedestrian, sign, cyclist) to COCO-80 index; None is left out."""
+"""Label.Type (unknown, vehicle, pedestrian, sign, cyclist) to COCO-80 index; None is left out. Buses, trucks and
+motorcycles are vehicles too, so they count as cars."""
 VISIBILITY_BY_DIFFICULTY: Mapping[int, float] = {0: 1.0, 1: 1.0, 2: 0.5}
 """Label.DifficultyLevel to visible share. Waymo tells no share: LEVEL_2 marks what its labellers found hard to see, and
 the convention here is to count it as half seen; no level (the usual case of camera boxes) and LEVEL_1 as whole."""

@@ -44,13 +44,14 @@ class Lens:
         moved = points.reshape(outlines.shape)
         boxes = np.concatenate([moved.min(axis=1), moved.max(axis=1)], axis=1)
         clipped = np.clip(boxes, 0.0, np.array([*self._size_wh, *self._size_wh], np.float64)).astype(np.float32)
-        seen = (clipped[:, 2] > clipped[:, 0]) & (clipped[:, 3] > clipped[:, 1])
+        inside = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1) / np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+        seen = inside > 0
         return replace(
             truth,
             boxes_xyxy=clipped[seen],
             class_ids=truth.class_ids[seen],
             track_ids=truth.track_ids[seen],
-            visibility=truth.visibility[seen],
+            visibility=np.minimum(truth.visibility, inside)[seen].astype(np.float32),
         )
 
 

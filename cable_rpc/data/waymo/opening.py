@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
+from cable_rpc.data.sequence_spec import SequenceSpec, choose_sequence, parse_sequence_spec
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.data.waymo.camera import CameraName
 from cable_rpc.data.waymo.segment import WEBSITE, Segment
@@ -14,25 +16,14 @@ from cable_rpc.data.waymo.segment_v2 import ComponentSegment
 from cable_rpc.data.waymo.source import WaymoSource
 from cable_rpc.errors import ConfigurationError, SourceError
 
-LISTED_SEGMENTS = 10
+Value = TypeVar("Value")
+
 OPTION_KEYS = ("camera", "undistort")
 SWITCHES: Mapping[str, bool] = {"0": False, "1": True}
 TABLE_SUFFIX, RECORD_SUFFIX = ".parquet", ".tfrecord"
 RECORD_PREFIX = "segment-"
 RECORD_ENDING = "_with_camera_labels"
 COMPONENTS = ("camera_image", "camera_calibration", "camera_box", "vehicle_pose")
-
-
-@dataclass(frozen=True, slots=True)
-class WaymoSpec:
-    """A spec taken apart: ``ROOT#SEGMENT?camera=NAME&undistort=1``."""
-
-    spec: str
-    """As written, for error texts."""
-    root: Path
-    segment: str | None
-    camera: CameraName
-    undistort: bool
 
 
 def open_waymo(rest: str, options: SourceOptions) -> WaymoSource:
@@ -51,8 +42,9 @@ def open_waymo(rest: str, options: SourceOptions) -> WaymoSource:
         ConfigurationError: an option can't be used, or the segment isn't told and there are several.
         SourceError: the data set can't be read.
     """
-    spec = parse_spec(rest)
-    return WaymoSource(open_segment(spec, options), options, undistort=spec.undistort)
+    spec = parse_sequence_spec("waymo", rest, OPTION_KEYS)
+    undistort = chosen(spec, "undistort", SWITCHES, "0")
+    return WaymoSource(open_segment(spec, options), options, undistort=undistort)
 
 
 def sequences(root: Path) -> list[str]:
@@ -64,45 +56,33 @@ def sequences(root: Path) -> list[str]:
     return sorted(segment_files(root))
 
 
-def open_segment(spec: WaymoSpec, options: SourceOptions) -> Segment:
-    """The segment that is asked for, of the version that lies there."""
-    files = segment_files(spec.root)
-    name = choose_segment(spec, sorted(files))
-    path = files[name]
-    if path.suffix == TABLE_SUFFIX:
-        return ComponentSegment(path.parent.parent, name, spec.camera, options.bad_frames)
-    return RecordSegment(path, name, spec.camera, options.bad_frames)
-
-
-def parse_spec(rest: str) -> WaymoSpec:
-    """Take a spec apart.
+def open_segment(spec: SequenceSpec, options: SourceOptions) -> Segment:
+    """The segment that is asked for, of the version that lies there.
 
     Raises:
-        ConfigurationError: an option is unknown, comes twice or can't be used.
+        ConfigurationError: there is no such camera or segment, or the segment isn't told and there are several.
+        SourceError: the segment can't be read.
     """
-    spec = f"waymo:{rest}"
-    head, _, query = rest.partition("?")
-    root, _, segment = head.partition("#")
-    values: dict[str, str] = {}
-    for pair in query.split("&") if query else []:
-        key, separator, value = pair.partition("=")
-        if key not in OPTION_KEYS or not separator:
-            raise ConfigurationError(
-                f"'{spec}': write options as key=value, joined by &; known are {', '.join(OPTION_KEYS)}"
-            )
-        if key in values:
-            raise ConfigurationError(f"'{spec}': give {key} once")
-        values[key] = value
-    camera = values.get("camera", CameraName.FRONT.name).upper()
-    if camera not in CameraName.__members__:
-        known = ", ".join(CameraName.__members__)
-        raise ConfigurationError(f"'{spec}': there is no camera '{values['camera']}'; known are {known}")
-    undistort = values.get("undistort", "0")
-    if undistort not in SWITCHES:
-        raise ConfigurationError(f"'{spec}': undistort is '{undistort}'; give 0 or 1")
-    return WaymoSpec(
-        spec, Path(root), segment_name(segment) if segment else None, CameraName[camera], SWITCHES[undistort]
-    )
+    camera = chosen(spec, "camera", CameraName.__members__, CameraName.FRONT.name)
+    files = segment_files(spec.root)
+    asked = None if spec.sequence is None else segment_name(spec.sequence)
+    name = choose_sequence(replace(spec, sequence=asked), sorted(files))
+    path = files[name]
+    if path.suffix == TABLE_SUFFIX:
+        return ComponentSegment(path.parent.parent, name, camera, options.bad_frames)
+    return RecordSegment(path, name, camera, options.bad_frames)
+
+
+def chosen(spec: SequenceSpec, key: str, known: Mapping[str, Value], default: str) -> Value:
+    """What an option stands for, in capitals or not.
+
+    Raises:
+        ConfigurationError: it isn't known.
+    """
+    word = spec.values.get(key, default)
+    if word.upper() not in known:
+        raise ConfigurationError(f"'{spec.spec}': there is no {key} '{word}'; known are {', '.join(known)}")
+    return known[word.upper()]
 
 
 def segment_name(stem: str) -> str:
@@ -114,10 +94,12 @@ def segment_files(root: Path) -> dict[str, Path]:
     """Segments by context name: the TFRecord file, or the ``camera_image`` table of each.
 
     Raises:
-        SourceError: there is no such root, or it holds no segment.
+        SourceError: there is no such root, or it is or holds no segment.
     """
-    if root.is_file():
+    if root.is_file() and root.suffix in (TABLE_SUFFIX, RECORD_SUFFIX):
         return {segment_name(root.stem): root}
+    if root.is_file():
+        raise SourceError(f"{root} is no file of the Waymo Open Dataset, which are *{TABLE_SUFFIX} or *{RECORD_SUFFIX}")
     if not root.is_dir():
         raise SourceError(f"no such file or folder: {root}; the Waymo Open Dataset is to be had at {WEBSITE}")
     patterns = ("camera_image/*.parquet", "*/camera_image/*.parquet", "*.tfrecord", "*/*.tfrecord")
@@ -135,18 +117,3 @@ def segment_files(root: Path) -> dict[str, Path]:
         f"{root} holds no Waymo segment: neither camera_image/*.parquet (version 2) nor *.tfrecord (version 1), also "
         f"not one folder deeper; the data set is to be had at {WEBSITE}"
     )
-
-
-def choose_segment(spec: WaymoSpec, names: Sequence[str]) -> str:
-    """The segment that is asked for, or the only one.
-
-    Raises:
-        ConfigurationError: it isn't there, or there are several.
-    """
-    some = ", ".join(f"'{name}'" for name in names[:LISTED_SEGMENTS])
-    more = f" and {len(names) - LISTED_SEGMENTS} more" if len(names) > LISTED_SEGMENTS else ""
-    if spec.segment is None and len(names) > 1:
-        raise ConfigurationError(f"'{spec.spec}' has {len(names)} segments; add #SEGMENT, one of {some}{more}")
-    if spec.segment is not None and spec.segment not in names:
-        raise ConfigurationError(f"'{spec.spec}': there is no segment '{spec.segment}'; use one of {some}{more}")
-    return names[0] if spec.segment is None else spec.segment

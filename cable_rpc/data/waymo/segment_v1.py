@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from google.protobuf.message import DecodeError
 
 from cable_rpc.data.bad_frames import BadFrames
-from cable_rpc.data.poses import motion_from_poses
-from cable_rpc.data.waymo.camera import (
-    Calibration,
-    CameraName,
-    motion_of_velocity,
-    pose_matrix,
-    read_calibration,
-)
+from cable_rpc.data.waymo.camera import Calibration, CameraName, read_calibration
 from cable_rpc.data.waymo.labels import BoxLabel
+from cable_rpc.data.waymo.motion import FloatArray, motion_of_poses, motion_of_velocity, pose_matrix
 from cable_rpc.data.waymo.schema import frame_class
 from cable_rpc.data.waymo.segment import NS_PER_MICROSECOND, CameraRecord
 from cable_rpc.data.waymo.stamps import frame_stamp
@@ -66,7 +59,7 @@ class RecordSegment:
             raise SourceError(f"{path} holds no frame")
         self.times_ns = [frame.time_ns for frame in self._frames]
         self.calibration = self._read_calibration()
-        self._motion: list[EgoMotion] | None = None
+        self._motion: Mapping[int, EgoMotion | None] | None = None
 
     def _read_calibration(self) -> Calibration:
         for frame in self._frames:
@@ -120,23 +113,37 @@ class RecordSegment:
         if image.HasField("velocity"):
             v = image.velocity
             pose = image.pose if image.HasField("pose") else frame.pose
-            matrix = pose_matrix(list(pose.transform), f"{where}: the pose")
-            return motion_of_velocity((v.v_x, v.v_y, v.v_z), (v.w_x, v.w_y, v.w_z), matrix, where)
-        if len(self._frames) == 1:
-            return None
+            return motion_of_velocity((v.v_x, v.v_y, v.v_z), (v.w_x, v.w_y, v.w_z), list(pose.transform), where)
         if self._motion is None:
-            self._motion = motion_from_poses(
-                np.array(self.times_ns, np.int64), np.stack([self._pose(frame) for frame in self._frames])
-            )
-        return self._motion[place]
+            self._motion = self._motion_of_frames()
+        time_ns = self.times_ns[place]
+        if time_ns not in self._motion:
+            raise SourceError(f"{where} has neither a velocity nor a sound pose")
+        return self._motion[time_ns]
 
-    def _pose(self, frame: StampedSpan) -> Any:
-        where = f"{self._path} record {frame.span.number}: the pose"
-        transform = type(frame_class()().pose)
-        try:
-            return pose_matrix(list(transform.FromString(frame.pose).transform), where)
-        except DecodeError:
-            raise SourceError(f"{where} is damaged") from None
+    def _motion_of_frames(self) -> dict[int, EgoMotion | None]:
+        """What the frames' poses tell; damaged ones are left out."""
+        poses: dict[int, FloatArray] = {}
+        for frame in self._frames:
+            try:
+                poses[frame.time_ns] = read_pose(frame, f"{self._path} record {frame.span.number}: the pose")
+            except SourceError as error:
+                self._bad_frames.found(error)
+        return motion_of_poses(poses)
+
+
+def read_pose(frame: StampedSpan, place: str) -> FloatArray:
+    """The pose of a frame, float64 [4, 4].
+
+    Raises:
+        SourceError: it is damaged.
+    """
+    transform = type(frame_class()().pose)
+    try:
+        values = list(transform.FromString(frame.pose).transform)
+    except DecodeError:
+        raise SourceError(f"{place} is damaged") from None
+    return pose_matrix(values, place)
 
 
 def stamped_spans(path: Path, bad_frames: BadFrames) -> list[StampedSpan]:

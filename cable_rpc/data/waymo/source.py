@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from cable_rpc.data.coco.images import safe_name
-from cable_rpc.data.coco.source import nominal_fps, thinned
+from cable_rpc.data.frame_rate import nominal_fps, thinned
+from cable_rpc.data.image_file import decode_whole_image
+from cable_rpc.data.names import safe_name
 from cable_rpc.data.resize import resize_frame
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.data.waymo.camera import CameraName, camera_mount
-from cable_rpc.data.waymo.images import decode_jpeg
 from cable_rpc.data.waymo.labels import TrackNumbers, ground_truth
 from cable_rpc.data.waymo.lens import Lens
 from cable_rpc.data.waymo.segment import CameraRecord, Segment
@@ -74,7 +74,7 @@ class WaymoSource:
 
     def _frame(self, record: CameraRecord, index: int) -> Frame:
         calibration = self._segment.calibration
-        image = decode_jpeg(record.jpeg, record.place)
+        image = decode_whole_image(record.jpeg, record.place)
         if (image.shape[1], image.shape[0]) != calibration.size_wh:
             raise SourceError(
                 f"{record.place}: the image is {image.shape[1]}x{image.shape[0]}, the calibration is for "

@@ -12,7 +12,8 @@ from typing import Any
 from cable_rpc.errors import ConfigurationError, SourceError
 
 BUFFER_BYTES = 1 << 20
-"""Read ahead per column; without it a whole row group's images would be held."""
+"""Read ahead per column; without it a whole row group's images would be held. A page or a dictionary, the least that
+Parquet can unpack, is held whole in any case."""
 BATCH_ROWS = 16
 
 

@@ -24,11 +24,13 @@ def write_waymo_v1(
         camera: what the frames' camera is called.
 
     Raises:
-        ValueError: a frame has no ego-motion or intrinsics.
+        ValueError: a drive has no frame, or one without ego-motion or intrinsics.
     """
     root.mkdir(parents=True, exist_ok=True)
     for name, frames in drives.items():
-        records = (message.SerializeToString() for message in frame_messages(name, frames, camera))
+        records = [message.SerializeToString() for message in frame_messages(name, frames, camera)]
+        if not records:
+            raise ValueError(f"drive '{name}' has no frame")
         write_records(root / f"segment-{name}_with_camera_labels.tfrecord", records)
 
 

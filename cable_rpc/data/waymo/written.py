@@ -16,8 +16,9 @@ from cable_rpc.types import GroundTruth
 EPOCH_MICROS = 1_550_000_000_000_000
 """Added to the time stamps, which count from 0 in a rendered drive."""
 JPEG_QUALITY = 95
-TYPE_BY_CLASS: Mapping[int, int] = {0: 2, 1: 4, 2: 1, 3: 4, 5: 1, 7: 1}
-"""COCO-80 index to Label.Type; all motor vehicles on four wheels or more are one to Waymo."""
+TYPE_BY_CLASS: Mapping[int, int] = {0: 2, 1: 4, 2: 1, 3: 1, 5: 1, 7: 1}
+"""COCO-80 index to Label.Type; all that has a motor, motorcycles too, is one to Waymo (its docs/
+labeling_specifications.md)."""
 LEVEL_1, LEVEL_2 = 1, 2
 HALF_SEEN = 0.5
 OPTICAL_FROM_WAYMO = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

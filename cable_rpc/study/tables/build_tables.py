@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from cable_rpc.study.metrics import Bootstrap, mean_or_none
-from cable_rpc.study.sequence_metrics import DatasetMetrics, pool
+from cable_rpc.study.sequence_metrics import pool
 from cable_rpc.study.tables.cells import Cell
 from cable_rpc.study.tables.data_sets import paper_order, title_of
+from cable_rpc.study.tables.equal_quality import pool_equal_quality
 from cable_rpc.study.tables.paper_values import COMPARISON_DATA_SET, CROSS_DATA_SET, STRATEGIES, PaperRow
 from cable_rpc.study.tables.result_table import Column, ResultTable, Row, Value
-from cable_rpc.study.tables.table_columns import ACROSS_DATA_SETS, ACROSS_STRATEGIES, Measure
+from cable_rpc.study.tables.table_columns import ACROSS_DATA_SETS, ACROSS_STRATEGIES, Measure, PooledCells
 
 AVERAGE = "average"
-Pooled = Mapping[tuple[str, str], DatasetMetrics]
-"""(data set, strategy) to the metrics of all sequences that were measured; only what has any."""
+Pooled = Mapping[tuple[str, str], PooledCells]
+"""(data set, strategy) to all sequences that were measured; only what has any."""
 Parts = Sequence[tuple[str, Sequence[Measure]]]
 
 
@@ -26,7 +27,10 @@ def pooled_cells(cells: Sequence[Cell], bootstrap: Bootstrap | None = None) -> P
             groups.setdefault((cell.request.dataset, cell.strategy), []).append(cell)
     keys = sorted(groups, key=lambda key: paper_order(key[0]))
     return {
-        key: pool([cell.metrics for cell in groups[key] if cell.metrics is not None], bootstrap=bootstrap)
+        key: PooledCells(
+            pool([cell.metrics for cell in groups[key] if cell.metrics is not None], bootstrap=bootstrap),
+            pool_equal_quality([cell.equal_quality for cell in groups[key]], bootstrap),
+        )
         for key in keys
     }
 
@@ -45,10 +49,10 @@ def table_one(
     """
     rows: list[Row] = []
     ours: list[Row] = []
-    for (dataset, name), metrics in pooled.items():
+    for (dataset, name), found in pooled.items():
         if name != strategy:
             continue
-        ours.append(Row(title_of(dataset), figures(metrics, ACROSS_DATA_SETS, by_frame=by_frame)))
+        ours.append(Row(title_of(dataset), figures(found, ACROSS_DATA_SETS, by_frame=by_frame)))
         rows += [ours[-1], *printed_rows(f"{title_of(dataset)} (paper)", CROSS_DATA_SET.get(dataset))]
     if len(ours) > 1:
         rows.append(Row("average", averages(ours)))
@@ -73,9 +77,9 @@ def table_two(
     for dataset in dict.fromkeys(key[0] for key in pooled):
         block = title_of(dataset)
         for strategy in strategies:
-            metrics = pooled.get((dataset, strategy))
-            if metrics is not None:
-                rows.append(Row(strategy, figures(metrics, ACROSS_STRATEGIES, by_frame=by_frame), block=block))
+            found = pooled.get((dataset, strategy))
+            if found is not None:
+                rows.append(Row(strategy, figures(found, ACROSS_STRATEGIES, by_frame=by_frame), block=block))
             if dataset == COMPARISON_DATA_SET:
                 rows += printed_rows(f"{strategy} (paper)", STRATEGIES.get(strategy), block)
     if all(dataset != COMPARISON_DATA_SET for dataset, _ in pooled):
@@ -97,10 +101,10 @@ def parts_of(parts: Parts) -> list[tuple[str, list[Column]]]:
     return [(caption, [measure.column for measure in measures]) for caption, measures in parts]
 
 
-def figures(metrics: DatasetMetrics, parts: Parts, *, by_frame: bool) -> dict[str, Value]:
+def figures(found: PooledCells, parts: Parts, *, by_frame: bool) -> dict[str, Value]:
     """A row's figures by column."""
     return {
-        measure.column.key: measure.value(metrics, by_frame=by_frame) for _, measures in parts for measure in measures
+        measure.column.key: measure.value(found, by_frame=by_frame) for _, measures in parts for measure in measures
     }
 
 

@@ -11,10 +11,11 @@ from typing import Any, Self
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.run_record import write_json
 from cable_rpc.study.sequence_metrics import SequenceMetrics
+from cable_rpc.study.tables.equal_quality import EqualQuality
 from cable_rpc.study.tables.identity import cell_identity, cell_key
 from cable_rpc.study.tables.settings import RunSettings, SequenceRequest
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 CELLS_FOLDER = "cells"
 
 
@@ -34,6 +35,8 @@ class Cell:
     """Damage that was left out, one line each."""
     detector: str = ""
     segmenter: str = ""
+    equal_quality: EqualQuality | None = None
+    """None where it failed, or was not asked for."""
 
     @property
     def title(self) -> str:
@@ -52,12 +55,13 @@ class Cell:
             "detector": self.detector,
             "segmenter": self.segmenter,
             "metrics": None if self.metrics is None else self.metrics.to_json(),
+            "equal_quality": None if self.equal_quality is None else self.equal_quality.to_json(),
         }
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Self:
         """The inverse of `to_json`."""
-        metrics = content["metrics"]
+        metrics, equal_quality = content["metrics"], content["equal_quality"]
         return cls(
             SequenceRequest(content["dataset"], content["spec"]),
             content["strategy"],
@@ -67,6 +71,7 @@ class Cell:
             tuple(content["skipped"]),
             content["detector"],
             content["segmenter"],
+            None if equal_quality is None else EqualQuality.from_json(equal_quality),
         )
 
 

@@ -33,6 +33,8 @@ MEASURING_PARTS = (
     "study/strategies.py",
     "study/prefill.py",
     "study/transport_estimate.py",
+    "study/tables/equal_quality.py",
+    "study/tables/ladder.py",
     "study/tables/lane.py",
     "study/tables/measured_frame.py",
     "study/tables/score_keeper.py",

@@ -16,7 +16,7 @@ from cable_rpc.edge.strategy import RoiStrategy
 from cable_rpc.errors import RemoteError
 from cable_rpc.study.tables.models import LoadedModels
 from cable_rpc.study.tables.session_in_process import SessionInProcess
-from cable_rpc.types import Detections, Segmentation
+from cable_rpc.types import Detections, Image, Segmentation
 from cable_rpc.wire.answers import FrameAnswer
 
 
@@ -40,6 +40,8 @@ class Passage:
     segmentation: Segmentation
     detections: Detections
     """Weak ones included."""
+    picture: Image
+    """uint8 [height, width, 3], BGR, as the models saw it."""
     apply_ns: int
 
     @property
@@ -109,8 +111,8 @@ class Lane:
         strategy = self._encoder.strategy
         strategy.sent(prepared.index, prepared.uplink_message_bytes)
         answer = await self._session.exchange(prepared.message)
-        segmentation = answer.segmentation
-        if segmentation is None:
+        segmentation, picture = answer.segmentation, self._keeper.picture
+        if segmentation is None or picture is None:
             raise RemoteError(f"frame {prepared.index} was answered without a mask")
         started_ns = time.monotonic_ns()
         strategy.update(
@@ -119,4 +121,4 @@ class Lane:
             confidence=segmentation.confidence,
             uncertainty=segmentation.uncertainty,
         )
-        return Passage(prepared, answer, segmentation, self._keeper.newest, time.monotonic_ns() - started_ns)
+        return Passage(prepared, answer, segmentation, self._keeper.newest, picture, time.monotonic_ns() - started_ns)

@@ -24,6 +24,7 @@ def table_notes(cells: Sequence[Cell], settings: RunSettings, *, by_frame: bool,
         f"{settings.reference_text}, counted at four layers: coded picture, + mask, + protobuf message, + headers of "
         "gRPC, HTTP/2, TCP and IP (an estimate). kbit/s is of messages.",
         quality_note(settings),
+        *equal_quality_notes(cells, settings),
         f"Tokens and the prefill's paper and FLOPs columns follow from coverage with {VISUAL_TOKENS} visual and "
         f"{PROMPT_TOKENS} prompt tokens; the paper's column takes all work for attention. Timed is the prefill of the "
         "whole frame over that of the received one, Tok real the share of tokens that never entered, both as the "
@@ -56,11 +57,30 @@ def averaging_note(settings: RunSettings, *, by_frame: bool) -> str:
 def quality_note(settings: RunSettings) -> str:
     """How comparable the bytes are."""
     if settings.codec == REFERENCE_CODEC:
-        return "Equal encoder setting is not equal task quality; for bytes at equal quality see `codec-study`."
+        return "Equal encoder setting is not equal quality: a region alone is coded better than in its frame."
     return (
         f"Regions were coded in {settings.quality_text}, whole frames in {settings.reference_text}: the two settings "
         "are not equal quality."
     )
+
+
+def equal_quality_notes(cells: Sequence[Cell], settings: RunSettings) -> Iterator[str]:
+    """What the bytes at equal quality are, and where there are none."""
+    if not settings.equal_quality:
+        yield "Bytes at equal PSNR were not measured (--no-equal-quality)."
+        return
+    yield (
+        "Equal PSNR: dB is the luma PSNR inside what was sent (keyframes whole), squared errors pooled over frames; "
+        f"saved, in %, is messages against those of the same frames whole in {REFERENCE_CODEC} at the CRF that gives "
+        "that PSNR there, interpolated (PCHIP of log bytes) between CRFs that were coded, never beyond."
+    )
+    found: dict[str, list[str]] = {}
+    for cell in cells:
+        if cell.equal_quality is not None and cell.equal_quality.whole_bytes() is None:
+            found.setdefault(cell.sequence, []).append(cell.strategy)
+    if found:
+        lost = "; ".join(f"{sequence} ({', '.join(names)})" for sequence, names in found.items())
+        yield f"Left out of the saving at equal PSNR, which lies beyond the CRFs coded: {lost}."
 
 
 def beside(workers: int) -> str:

@@ -22,10 +22,10 @@ from cable_rpc.study.tables.draw_csv import draw_csv, texts_of
 from cable_rpc.study.tables.draw_latex import draw_latex
 from cable_rpc.study.tables.draw_markdown import draw_markdown
 from cable_rpc.study.tables.draw_terminal import draw_terminal
+from cable_rpc.study.tables.equal_quality import EQUAL_QUALITY_FIGURES
 from cable_rpc.study.tables.notes import table_notes
 from cable_rpc.study.tables.result_table import ResultTable
 from cable_rpc.study.tables.settings import RunSettings
-from cable_rpc.study.tables.table_columns import estimate, value_of
 
 MARKDOWN_FILE = "tables.md"
 FIGURES_FILE = "figures.csv"
@@ -113,11 +113,11 @@ class TableReport:
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["data_set", "strategy", "figure", "value", "low", "high", "meaning"])
-        for (dataset, strategy), metrics in self.pooled.items():
-            for name in (*FIGURES, *AP_FIGURES):
-                figures = texts_of(value_of(estimate(metrics, name)), intervals=True)
-                meaning = FIGURES[name].meaning if name in FIGURES else "COCO's average precision"
-                writer.writerow([dataset, strategy, name, *figures, meaning])
+        meanings = {name: figure.meaning for name, figure in FIGURES.items()}
+        meanings |= dict.fromkeys(AP_FIGURES, "COCO's average precision") | dict(EQUAL_QUALITY_FIGURES)
+        for (dataset, strategy), found in self.pooled.items():
+            for name, meaning in meanings.items():
+                writer.writerow([dataset, strategy, name, *texts_of(found.figure(name), intervals=True), meaning])
         return text.getvalue()
 
     def texts(self) -> dict[str, str]:

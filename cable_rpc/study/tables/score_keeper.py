@@ -27,18 +27,20 @@ class ScoreKeeper:
         self.device = detector.device
         self.newest = Detections.empty()
         """All of the last picture, weak ones included."""
+        self.picture: Image | None = None
+        """The last picture, as decoded."""
 
     def detect(self, images: Sequence[Image]) -> list[Detections]:
         """See `Detector`."""
-        return self._kept(self._detector.detect(images))
+        return self._kept(images, self._detector.detect(images))
 
     def detect_regions(self, images: Sequence[Image], regions: Sequence[BoolMask | None]) -> list[Detections]:
         """See `RegionDetector`; a detector that is none sees the whole pictures."""
         if isinstance(self._detector, RegionDetector):
-            return self._kept(self._detector.detect_regions(images, regions))
+            return self._kept(images, self._detector.detect_regions(images, regions))
         return self.detect(images)
 
-    def _kept(self, found: list[Detections]) -> list[Detections]:
+    def _kept(self, images: Sequence[Image], found: list[Detections]) -> list[Detections]:
         if found:
-            self.newest = found[-1]
+            self.newest, self.picture = found[-1], images[-1]
         return [one.select(one.scores >= self._min_score) for one in found]

@@ -21,6 +21,8 @@ from cable_rpc.errors import CableError, SourceError
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE, SequenceMeter
 from cable_rpc.study.strategies import open_strategy
 from cable_rpc.study.tables.cells import Cell
+from cable_rpc.study.tables.equal_quality import EqualQuality
+from cable_rpc.study.tables.ladder import LadderFrame, WholeFrameLadder
 from cable_rpc.study.tables.lane import Lane, LaneSettings, Passage
 from cable_rpc.study.tables.measured_frame import measured_frame
 from cable_rpc.study.tables.models import LoadedModels, load_models
@@ -50,6 +52,13 @@ class RunningStrategy:
     """None where the reference's passages are its own."""
     meter: SequenceMeter
     error: str = ""
+    equal_quality: EqualQuality | None = None
+
+    def cell(self, common: Cell) -> Cell:
+        """What became of it."""
+        if self.error:
+            return replace(common, strategy=self.name, error=self.error)
+        return replace(common, strategy=self.name, metrics=self.meter.metrics(), equal_quality=self.equal_quality)
 
 
 def run_sequence(task: SequenceTask, load: ModelLoader = load_models) -> list[Cell]:
@@ -70,10 +79,7 @@ def run_sequence(task: SequenceTask, load: ModelLoader = load_models) -> list[Ce
     common = replace(common, skipped=tuple(bad.skipped))
     if error:
         return [replace(common, strategy=strategy, error=error) for strategy in task.strategies]
-    return [
-        replace(common, strategy=one.name, metrics=None if one.error else one.meter.metrics(), error=one.error)
-        for one in running
-    ]
+    return [one.cell(common) for one in running]
 
 
 def told(failure: Exception) -> str:
@@ -110,12 +116,16 @@ async def run_strategies(
         reference = await stack.enter_async_context(
             Lane(FullFrame(settings.block_size), reference_settings(settings), source, models)
         )
+        ladder = WholeFrameLadder(reference_settings(settings), source) if settings.equal_quality else None
+        if ladder is not None:
+            stack.enter_context(ladder)
         running.extend([await start(name, settings, source, models, stack) for name in task.strategies])
         count = 0
         for captured in captured_frames(source):
             whole = await reference.carry(captured)
+            at_all_settings = None if ladder is None else ladder.code(captured.frame.image, whole)
             for one in running:
-                await advance(one, captured, whole)
+                await advance(one, captured, whole, at_all_settings)
             count += 1
         if count == 0:
             raise SourceError(f"'{task.request.spec}' has no frames; choose another sequence or allow more of them")
@@ -135,13 +145,18 @@ async def start(
         return RunningStrategy(name, None, meter, told(failure))
 
 
-async def advance(one: RunningStrategy, captured: CapturedFrame, whole: Passage) -> None:
+async def advance(
+    one: RunningStrategy, captured: CapturedFrame, whole: Passage, at_all_settings: LadderFrame | None
+) -> None:
     """One more frame of a strategy that has not failed."""
     if one.error:
         return
     try:
         passage = whole if one.lane is None else await one.lane.carry(captured)
         one.meter.add(measured_frame(captured.frame, passage, whole))
+        if at_all_settings is not None:
+            found = at_all_settings.beside(passage)
+            one.equal_quality = found if one.equal_quality is None else one.equal_quality + found
     except Exception as failure:
         where = f"frame {captured.frame.index}"
         text = told(failure)

@@ -46,6 +46,8 @@ class RunSettings:
     """(width, height) to resize to."""
     fps: float | None = None
     skip_bad: bool = False
+    equal_quality: bool = True
+    """Whether whole frames are also coded at other settings, for the bytes that equal quality takes."""
 
     @property
     def used_treatment(self) -> RegionTreatment:

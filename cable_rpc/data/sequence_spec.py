@@ -1,17 +1,18 @@
-"""Specs of data sets in folders, ``ROOT#SEQUENCE?key=value&...``, and the choice of a sequence."""
+"""Specs of data sets, ``ROOT#SEQUENCE?key=value&...``, and the choice of a sequence."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import unquote
 
-from cable_rpc.data.coco.opening import listed
+from cable_rpc.data.names import listed
 from cable_rpc.errors import ConfigurationError, SourceError
 
 
 @dataclass(frozen=True, slots=True)
-class FolderSpec:
+class SequenceSpec:
     """A spec taken apart."""
 
     spec: str
@@ -22,17 +23,22 @@ class FolderSpec:
     """Options after ``?``."""
 
 
-def parse_folder_spec(scheme: str, rest: str, known_keys: Sequence[str] = ()) -> FolderSpec:
+def parse_sequence_spec(scheme: str, rest: str, known_keys: Sequence[str] = ()) -> SequenceSpec:
     """Take a spec apart.
 
+    Args:
+        scheme: of the data set.
+        rest: what follows it. Values may be percent-encoded.
+        known_keys: of the options that the data set has.
+
     Raises:
-        ConfigurationError: no folder is named, or an option is unknown, comes twice or has no value.
+        ConfigurationError: no root is named, or an option is unknown, comes twice or has no value.
     """
     spec = f"{scheme}:{rest}"
     head, _, query = rest.partition("?")
     root, _, sequence = head.partition("#")
     if not root:
-        raise ConfigurationError(f"'{spec}' names no folder; write {scheme}:ROOT#SEQUENCE")
+        raise ConfigurationError(f"'{spec}' names no file or folder; write {scheme}:ROOT#SEQUENCE")
     values: dict[str, str] = {}
     for pair in query.split("&") if query else []:
         key, _, value = pair.partition("=")
@@ -41,11 +47,11 @@ def parse_folder_spec(scheme: str, rest: str, known_keys: Sequence[str] = ()) ->
             raise ConfigurationError(f"'{spec}': option '{pair}'; write key=value, joined by &; {known}")
         if key in values:
             raise ConfigurationError(f"'{spec}': give {key} once")
-        values[key] = value
-    return FolderSpec(spec, Path(root), sequence or None, values)
+        values[key] = unquote(value)
+    return SequenceSpec(spec, Path(root), sequence or None, values)
 
 
-def choose_sequence(spec: FolderSpec, names: Sequence[str]) -> str:
+def choose_sequence(spec: SequenceSpec, names: Sequence[str]) -> str:
     """The sequence asked for, or the only one.
 
     Raises:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -44,6 +45,22 @@ def read_stamps(path: Path) -> list[int]:
             raise SourceError(f"{path} line {number}: '{line}' is no time like 2018-03-06 15:02:33.123456789")
         stamps.append(stamp)
     return stamps
+
+
+def read_stamps_by_number(path: Path) -> Callable[[int], int]:
+    """Number of a file to its capture time in ns, which raises SourceError for a number without a line.
+
+    Raises:
+        SourceError: the file can't be read, or a line is no time.
+    """
+    stamps = read_stamps(path)
+
+    def stamp_of(number: int) -> int:
+        if number >= len(stamps):
+            raise SourceError(f"{path} has {len(stamps)} lines, none for image {number}")
+        return stamps[number]
+
+    return stamp_of
 
 
 def stamp_text(time_ns: int) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cable_rpc.data.coco.image_file import read_whole_image
-from cable_rpc.data.coco.source import nominal_fps, thinned
+from cable_rpc.data.frame_rate import nominal_fps, thinned
+from cable_rpc.data.image_file import read_whole_image
 from cable_rpc.data.source import SourceOptions
 from cable_rpc.errors import SourceError
 from cable_rpc.types import Image
