@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from cable_codecs import RegionTreatment
+
 from cable_rpc.study.metrics import GROUPS
 from cable_rpc.study.prefill import PROMPT_TOKENS, VISUAL_TOKENS
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE
@@ -20,6 +22,7 @@ def table_notes(cells: Sequence[Cell], settings: RunSettings, *, by_frame: bool,
     """The footnotes of both tables."""
     return (
         averaging_note(settings, by_frame=by_frame),
+        treatment_note(settings.treatment),
         "Pixels saved is no measure of bytes. Bytes saved is against the same frames whole in "
         f"{settings.reference_text}, counted at four layers: coded picture, + mask, + protobuf message, + headers of "
         "gRPC, HTTP/2, TCP and IP (an estimate). kbit/s is of messages.",
@@ -37,6 +40,17 @@ def table_notes(cells: Sequence[Cell], settings: RunSettings, *, by_frame: bool,
         *model_notes(cells),
         *data_notes(cells),
         "Rows marked paper are as printed by Que et al.: LISA++ 7B and RT-DETR R50, sequences and frames not told.",
+    )
+
+
+def treatment_note(treatment: RegionTreatment) -> str:
+    """What the codec and the models get outside the region."""
+    shown = "the region's own colours, spread outward" if treatment.refill == "diffuse" else "a constant colour"
+    if treatment.compose or not treatment.refills:
+        shown = "what was received there"
+    return (
+        f"Regions lie on a grid of {treatment.grid} px; outside them the codec gets the fill '{treatment.fill}', the "
+        f"models see {shown}."
     )
 
 
