@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from cable_codecs import RegionTreatment
-
 from cable_rpc.study.metrics import GROUPS
 from cable_rpc.study.prefill import PROMPT_TOKENS, VISUAL_TOKENS
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE
@@ -22,7 +20,7 @@ def table_notes(cells: Sequence[Cell], settings: RunSettings, *, by_frame: bool,
     """The footnotes of both tables."""
     return (
         averaging_note(settings, by_frame=by_frame),
-        treatment_note(settings.treatment),
+        treatment_note(settings),
         "Pixels saved is no measure of bytes. Bytes saved is against the same frames whole in "
         f"{settings.reference_text}, counted at four layers: coded picture, + mask, + protobuf message, + headers of "
         "gRPC, HTTP/2, TCP and IP (an estimate). kbit/s is of messages.",
@@ -43,8 +41,9 @@ def table_notes(cells: Sequence[Cell], settings: RunSettings, *, by_frame: bool,
     )
 
 
-def treatment_note(treatment: RegionTreatment) -> str:
+def treatment_note(settings: RunSettings) -> str:
     """What the codec and the models get outside the region."""
+    treatment = settings.used_treatment
     shown = "the region's own colours, spread outward" if treatment.refill == "diffuse" else "a constant colour"
     if treatment.compose or not treatment.refills:
         shown = "what was received there"
