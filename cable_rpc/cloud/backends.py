@@ -74,7 +74,8 @@ class Segmenter(Protocol):
     device: str
 
     def segment(self, image: Image, roi: BoolMask, prompt: str, context: FrameContext) -> Segmentation:
-        """Mask for a uint8 [H, W, 3] BGR image whose pixels outside ``roi`` (bool [H, W]) are blank.
+        """Mask for a uint8 [H, W, 3] BGR image whose pixels outside ``roi`` (bool [H, W]) are made up
+        (the region's own colours, one colour, an old background).
 
         The caller intersects the mask with the region.
         """

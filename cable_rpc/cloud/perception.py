@@ -72,7 +72,7 @@ class PerceptionModels:
         """Runs both models on one picture.
 
         Args:
-            image: uint8 [H, W, 3] BGR, blank outside the region.
+            image: uint8 [H, W, 3] BGR, outside the region what the treatment shows there.
             roi: bool [H, W]; None = the whole frame.
             prompt: sentence for the segmenter; empty = `DEFAULT_PROMPT`.
             min_score: detections below are dropped.

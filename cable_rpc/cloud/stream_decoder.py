@@ -27,7 +27,7 @@ class FrameRejection(FrameError):
 
 @dataclass(frozen=True, slots=True)
 class DecodedFrame:
-    """A decoded picture, outside its region as the treatment has it: blank, composed or kept."""
+    """A decoded picture, outside its region as the treatment has it: refilled, composed or kept."""
 
     image: Image
     """uint8 [H, W, 3] BGR."""

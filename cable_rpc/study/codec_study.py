@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 from cable_codecs import available_codecs
 
 from cable_rpc.errors import CableError, ConfigurationError
@@ -19,6 +15,7 @@ from cable_rpc.study.codec_compare import ANCHOR_CODEC
 from cable_rpc.study.codec_measure import check_clip, measure_point, prepare_clip
 from cable_rpc.study.study_points import POINTS_FILE, ClipRequest, PointStore, Setting, StudyPoint
 from cable_rpc.study.study_treatments import TREATMENTS, WHOLE, applies, find_treatment
+from cable_rpc.study.worker_pool import worker_pool
 
 QUALITIES: Mapping[str, tuple[int, ...]] = {
     "h264": (18, 23, 28, 33, 38),
@@ -172,27 +169,6 @@ def measured(cells: Sequence[Cell], workers: int) -> Iterator[tuple[Cell, list[S
             raise CableError(
                 "a worker of the codec study died, probably for want of memory; give --workers 1 or fewer --frames"
             ) from error
-
-
-@contextmanager
-def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that end at once when the study ends early."""
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), start_worker)
-    try:
-        yield pool
-    except BaseException:
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def start_worker() -> None:
-    """One thread for each process; Ctrl-C is the parent's to answer."""
-    cv2.setNumThreads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def measure_cell(cell: Cell) -> list[StudyPoint]:

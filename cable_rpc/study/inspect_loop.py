@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from cable_codecs import fill_background
+from cable_codecs import diffuse_background
 
 from cable_rpc.cloud.backends import Detector, FrameContext
 from cable_rpc.cloud.segmenters import BoxSegmenter
@@ -40,7 +40,7 @@ class Loop:
 
 
 class DetectorCloud:
-    """Boxes of a detector that sees only what was sent, filled: as the server's ``boxes`` segmenter answers."""
+    """Boxes of a detector that sees what was sent amid its own colours, as the server shows it by default."""
 
     def __init__(self, detector: Detector) -> None:
         self._detector = detector
@@ -49,7 +49,7 @@ class DetectorCloud:
     def __call__(self, frame: Frame, region: RoiMask) -> Segmentation:
         """Segment one frame, cut to the region."""
         sent = region.pixels()
-        image = fill_background(frame.image, sent, "zero")
+        image = diffuse_background(frame.image, sent)
         context = FrameContext(frame.index, self._detector.detect([image])[0])
         found = self._segmenter.segment(image, sent, "", context)
         known = None if found.uncertainty is None else np.where(sent, found.uncertainty, np.uint8(0))

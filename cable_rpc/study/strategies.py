@@ -27,13 +27,14 @@ STRATEGIES = {
 """Name to a short description."""
 
 
-def open_strategy(name: str, config: RoiConfig, block_size: int = 8) -> RoiStrategy:
+def open_strategy(name: str, config: RoiConfig, block_size: int = 8, *, keep_steps: bool = False) -> RoiStrategy:
     """A fresh strategy for one stream.
 
     Args:
         name: a key of `STRATEGIES`; ``edge-boxes:`` takes a detector as `load_detector` does.
         config: settings for those that predict.
         block_size: grid of the region that travels, in pixels.
+        keep_steps: show R_k itself in each proposal, where the strategy has one.
 
     Raises:
         ConfigurationError: unknown name or detector.
@@ -43,11 +44,11 @@ def open_strategy(name: str, config: RoiConfig, block_size: int = 8) -> RoiStrat
     if kind == "edge-boxes" and argument:
         return BoxRegions(detector_boxes(load_detector(argument, BackendOptions())), block_size=block_size)
     if name == "cable":
-        return RoiTracker(config, block_size)
+        return RoiTracker(config, block_size, keep_steps=keep_steps)
     if name == "no-corridor":
-        return RoiTracker(replace(config, corridor=False), block_size)
+        return RoiTracker(replace(config, corridor=False), block_size, keep_steps=keep_steps)
     if name == "open-loop":
-        return OpenLoop(config, block_size)
+        return OpenLoop(config, block_size, keep_steps=keep_steps)
     if name == "motion-only":
         return MotionOnly(config, block_size)
     if name == "full-frame":

@@ -10,7 +10,7 @@ from pathlib import Path
 from cable_rpc.study.tables.cells import Cell, CellStore
 from cable_rpc.study.tables.sequence_run import SequenceTask, run_sequence
 from cable_rpc.study.tables.settings import RunSettings, SequenceRequest
-from cable_rpc.study.tables.worker_pool import worker_pool
+from cable_rpc.study.worker_pool import worker_pool
 
 Listener = Callable[[Cell, bool], None]
 """Told of each cell, and whether it lay in the folder already."""

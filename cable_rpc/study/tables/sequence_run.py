@@ -13,10 +13,8 @@ from cable_codecs import CodecError, RegionTreatment
 
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.source import FrameSource, open_source
-from cable_rpc.edge.baselines import OpenLoop
 from cable_rpc.edge.capture import CapturedFrame
-from cable_rpc.edge.roi_tracker import RoiTracker
-from cable_rpc.edge.strategy import FullFrame, RoiStrategy
+from cable_rpc.edge.strategy import FullFrame
 from cable_rpc.errors import CableError, SourceError
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE, SequenceMeter
 from cable_rpc.study.strategies import open_strategy
@@ -139,7 +137,8 @@ async def start(
     if name == FULL_FRAME and settings.codec == REFERENCE_CODEC:
         return RunningStrategy(name, None, meter)
     try:
-        lane = Lane(strategy_with_steps(name, settings), lane_settings(settings), source, models)
+        strategy = open_strategy(name, settings.roi, settings.block_size, keep_steps=True)
+        lane = Lane(strategy, lane_settings(settings), source, models)
         return RunningStrategy(name, await stack.enter_async_context(lane), meter)
     except Exception as failure:
         return RunningStrategy(name, None, meter, told(failure))
@@ -173,22 +172,6 @@ def captured_frames(source: FrameSource) -> Iterator[CapturedFrame]:
             return
         now_ns = time.monotonic_ns()
         yield CapturedFrame(frame, now_ns - started_ns, now_ns)
-
-
-def strategy_with_steps(name: str, settings: RunSettings) -> RoiStrategy:
-    """A fresh strategy that shows R_k itself where it can.
-
-    Raises:
-        ConfigurationError: unknown name.
-    """
-    config, block_size = settings.roi, settings.block_size
-    if name == "cable":
-        return RoiTracker(config, block_size, keep_steps=True)
-    if name == "no-corridor":
-        return RoiTracker(replace(config, corridor=False), block_size, keep_steps=True)
-    if name == "open-loop":
-        return OpenLoop(config, block_size, keep_steps=True)
-    return open_strategy(name, config, block_size)
 
 
 def lane_settings(settings: RunSettings) -> LaneSettings:
