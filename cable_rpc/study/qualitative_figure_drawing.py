@@ -21,7 +21,7 @@ from matplotlib.patheffects import withStroke
 
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.annotate import GROUP_COLOURS, MASK_COLOUR, OTHER_COLOUR
-from cable_rpc.study.metrics import box_iou, retained
+from cable_rpc.study.metrics import retained, without_counterpart
 from cable_rpc.study.qualitative_figure import FigureRow, SentView, kept_pixels
 from cable_rpc.types import CLASS_GROUPS, Detections, Image
 
@@ -175,16 +175,8 @@ def strategy_panel(view: SentView, whole: SentView) -> Panel:
         f"{found} · {size_text(view)}",
         "keyframe" if view.keyframe else share_text(view),
         view.detections,
-        lost_boxes(whole.detections, view.detections),
+        whole.detections.boxes_xyxy[without_counterpart(whole.detections, view.detections)],
     )
-
-
-def lost_boxes(whole: Detections, found: Detections, iou_threshold: float = 0.5) -> npt.NDArray[np.float32]:
-    """Boxes of the whole frame's detections that no detection of their group overlaps by the threshold, [N, 4]."""
-    groups = [[CLASS_GROUPS.get(int(index), str(index)) for index in which.class_ids] for which in (whole, found)]
-    alike = np.array(groups[0])[:, None] == np.array(groups[1])[None, :]
-    reached = (box_iou(whole.boxes_xyxy, found.boxes_xyxy) >= iou_threshold) & alike
-    return whole.boxes_xyxy[~reached.any(axis=1)]
 
 
 def mask_picture(view: SentView) -> Image:

@@ -12,6 +12,7 @@ from cable_rpc.cli.figure import frame_numbers
 from cable_rpc.cloud.backends import FrameContext
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.annotate import MASK_COLOUR
+from cable_rpc.study.metrics import without_counterpart
 from cable_rpc.study.qualitative_figure import FigureRow, FigureSettings, SentView, figure_rows, kept_pixels
 from cable_rpc.types import BoolMask, Detections, Frame, Image, RoiMask, Segmentation
 
@@ -139,9 +140,9 @@ def detections(*boxes: tuple[int, int, int, int, int]) -> Detections:
 def test_lost_boxes_are_those_without_a_counterpart_of_their_group():
     whole = detections((0, 0, 10, 10, 2), (20, 0, 30, 10, 0), (40, 0, 50, 10, 7), (60, 0, 70, 10, 2))
     found = detections((0, 0, 10, 9, 7), (20, 0, 30, 10, 2), (40, 6, 50, 16, 7))
-    np.testing.assert_array_equal(drawing.lost_boxes(whole, found), whole.boxes_xyxy[1:])
-    np.testing.assert_array_equal(drawing.lost_boxes(whole, Detections.empty()), whole.boxes_xyxy)
-    assert drawing.lost_boxes(Detections.empty(), found).shape == (0, 4)
+    assert without_counterpart(whole, found).tolist() == [False, True, True, True]
+    assert without_counterpart(whole, Detections.empty()).all()
+    assert without_counterpart(Detections.empty(), found).shape == (0,)
 
 
 def view_of(blocks: BoolMask, *, keyframe: bool = False) -> SentView:

@@ -32,6 +32,8 @@ from cable_rpc.cloud.session import SessionLimits
 from cable_rpc.data.source import open_source
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.errors import ConfigurationError, ModelError
+from cable_rpc.study.closed_loop.models import LoadedModels, ModelChoice
+from cable_rpc.study.closed_loop.score_keeper import ScoreKeeper
 from cable_rpc.study.sequence_metrics import SequenceMetrics, pool
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
 from cable_rpc.study.tables import data_sets, identity
@@ -39,8 +41,6 @@ from cable_rpc.study.tables.cells import CELLS_FOLDER, Cell
 from cable_rpc.study.tables.data_sets import sequence_requests
 from cable_rpc.study.tables.engine import WORKER_DIED, run_cells
 from cable_rpc.study.tables.identity import cell_identity, cell_key
-from cable_rpc.study.tables.models import LoadedModels
-from cable_rpc.study.tables.score_keeper import ScoreKeeper
 from cable_rpc.study.tables.sequence_run import SequenceTask, run_sequence
 from cable_rpc.study.tables.settings import RunSettings, SequenceRequest
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
@@ -78,7 +78,7 @@ class WholeFrameSegmenter(BoxSegmenter):
         return super().segment(image, roi, prompt, context)
 
 
-def cheap_models(settings: RunSettings, segmenter: BoxSegmenter | None = None) -> LoadedModels:
+def cheap_models(choice: ModelChoice, segmenter: BoxSegmenter | None = None) -> LoadedModels:
     keeper = ScoreKeeper(TileDetector(), 0.4)
     runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
     return LoadedModels(PerceptionModels(keeper, segmenter or BoxSegmenter(), *runners), keeper)
@@ -121,7 +121,7 @@ def without_times(cell: Cell) -> dict[str, Any]:
 @pytest.mark.parametrize("strategy", ["cable", "motion-only"])
 async def test_a_cell_is_what_a_real_server_makes_of_the_same_frames(strategy: str, tmp_path: Path) -> None:
     """The same sequence through `stream` against a server on a socket: the other composition of the same parts."""
-    models = cheap_models(SETTINGS).perception
+    models = cheap_models(SETTINGS.models).perception
     async with PerceptionServer(models, ServerConfig("127.0.0.1:0", SessionLimits(), drain_s=1.0)) as server:
         source = open_source("synthetic:11", max_frames=4, size=(160, 96))
         config = StreamRunConfig(f"127.0.0.1:{server.port}", tmp_path, strategy=strategy)

@@ -15,11 +15,11 @@ from test_tables_engine import cheap_models
 
 from cable_rpc.data.source import open_source
 from cable_rpc.edge.capture import CapturedFrame
+from cable_rpc.study.closed_loop.lane import Lane, Passage
 from cable_rpc.study.metrics import Bootstrap
 from cable_rpc.study.tables.cells import Cell
 from cable_rpc.study.tables.equal_quality import EqualQuality, Rung, pool_equal_quality
 from cable_rpc.study.tables.ladder import ladder_crfs
-from cable_rpc.study.tables.lane import Lane, Passage
 from cable_rpc.study.tables.report import TableReport
 from cable_rpc.study.tables.sequence_run import SequenceTask, run_sequence
 from cable_rpc.study.tables.settings import RunSettings, SequenceRequest

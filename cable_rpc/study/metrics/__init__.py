@@ -22,6 +22,7 @@ from cable_rpc.study.metrics.matching import (
     inside_share,
     match_detections,
     match_frame,
+    without_counterpart,
 )
 from cable_rpc.study.metrics.recognition import (
     RECOGNITION_THRESHOLDS,
@@ -86,4 +87,5 @@ __all__ = [
     "sent_coverage",
     "size_bins",
     "visible_truth",
+    "without_counterpart",
 ]

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.study.metrics.truth_selection import GROUPS, group_indices
-from cable_rpc.types import Detections, Float32Array, Int32Array
+from cable_rpc.types import CLASS_GROUPS, Detections, Float32Array, Int32Array
 
 Float64Array = npt.NDArray[np.float64]
 
@@ -226,3 +226,14 @@ def match_detections(
     )
     right, wrong, missed = matches.counts()[0].sum(axis=0).tolist()
     return MatchCounts(right, wrong, missed)
+
+
+def without_counterpart(these: Detections, others: Detections, iou_threshold: float = 0.5) -> npt.NDArray[np.bool_]:
+    """Which detections no other of their class group overlaps by the threshold, bool [len(these)].
+
+    Nothing is assigned, so two of them may have the same counterpart: for pictures, not for counts.
+    """
+    groups = [[CLASS_GROUPS.get(int(index), str(index)) for index in which.class_ids] for which in (these, others)]
+    alike = np.array(groups[0])[:, None] == np.array(groups[1])[None, :]
+    reached = (box_iou(these.boxes_xyxy, others.boxes_xyxy) >= iou_threshold) & alike
+    return ~reached.any(axis=1)

@@ -12,8 +12,8 @@ from cable_codecs import CodecParameters, TreatedDecoder, TreatedEncoder, defaul
 from cable_codecs.quality import luma
 
 from cable_rpc.data.source import FrameSource
+from cable_rpc.study.closed_loop.lane import LaneSettings, Passage
 from cable_rpc.study.tables.equal_quality import EqualQuality, Rung
-from cable_rpc.study.tables.lane import LaneSettings, Passage
 from cable_rpc.types import Image
 from cable_rpc.wire.v1 import perception_pb2 as pb
 

@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 
-from cable_codecs import CodecError, RegionTreatment
+from cable_codecs import RegionTreatment
 
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.source import FrameSource, open_source
 from cable_rpc.edge.capture import CapturedFrame
 from cable_rpc.edge.strategy import FullFrame
-from cable_rpc.errors import CableError, SourceError
+from cable_rpc.errors import SourceError
+from cable_rpc.study.closed_loop.failure import told
+from cable_rpc.study.closed_loop.lane import Lane, LaneSettings, Passage
+from cable_rpc.study.closed_loop.measured_frame import Reference, measured_frame
+from cable_rpc.study.closed_loop.models import LoadedModels, ModelLoader, load_models
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE, SequenceMeter
 from cable_rpc.study.strategies import open_strategy
 from cable_rpc.study.tables.cells import Cell
 from cable_rpc.study.tables.equal_quality import EqualQuality
 from cable_rpc.study.tables.ladder import LadderFrame, WholeFrameLadder
-from cable_rpc.study.tables.lane import Lane, LaneSettings, Passage
-from cable_rpc.study.tables.measured_frame import measured_frame
-from cable_rpc.study.tables.models import LoadedModels, load_models
 from cable_rpc.study.tables.settings import FULL_FRAME, REFERENCE_CODEC, RunSettings, SequenceRequest
 from cable_rpc.types import Frame
-
-log = logging.getLogger(__name__)
-
-ModelLoader = Callable[[RunSettings], LoadedModels]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +64,7 @@ def run_sequence(task: SequenceTask, load: ModelLoader = load_models) -> list[Ce
     try:
         source = open_sequence(task, bad)
         common = replace(common, sequence=source.name)
-        models = load(task.settings)
+        models = load(task.settings.models)
         detector, segmenter = models.names
         common = replace(common, detector=detector, segmenter=segmenter)
         asyncio.run(run_strategies(task, source, models, running))
@@ -78,14 +74,6 @@ def run_sequence(task: SequenceTask, load: ModelLoader = load_models) -> list[Ce
     if error:
         return [replace(common, strategy=strategy, error=error) for strategy in task.strategies]
     return [one.cell(common) for one in running]
-
-
-def told(failure: Exception) -> str:
-    """An error as one line; the trace of one that nobody raised on purpose goes to the log."""
-    if isinstance(failure, (CableError, CodecError)):
-        return str(failure)
-    log.error("a cell failed", exc_info=failure)
-    return f"{type(failure).__name__}: {failure}"
 
 
 def open_sequence(task: SequenceTask, bad: BadFrames) -> FrameSource:
@@ -152,7 +140,7 @@ async def advance(
         return
     try:
         passage = whole if one.lane is None else await one.lane.carry(captured)
-        one.meter.add(measured_frame(captured.frame, passage, whole))
+        one.meter.add(measured_frame(captured.frame, passage, Reference.sent_whole(whole)))
         if at_all_settings is not None:
             found = at_all_settings.beside(passage)
             one.equal_quality = found if one.equal_quality is None else one.equal_quality + found

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from cable_codecs import STILL_CODECS, RegionTreatment, default_quality
 
 from cable_rpc.edge.roi_config import RoiConfig
+from cable_rpc.study.closed_loop.models import ModelChoice
 
 REFERENCE_CODEC = "h264"
 """Whole frames are always coded in it: what any saving of bytes is held against."""
@@ -48,6 +49,11 @@ class RunSettings:
     skip_bad: bool = False
     equal_quality: bool = True
     """Whether whole frames are also coded at other settings, for the bytes that equal quality takes."""
+
+    @property
+    def models(self) -> ModelChoice:
+        """What answers the frames."""
+        return ModelChoice(self.segmenter, self.detector, self.device, self.threads)
 
     @property
     def used_treatment(self) -> RegionTreatment:

@@ -2,26 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from cable_rpc.edge.proposal import RoiProposal
+from cable_rpc.study.closed_loop.lane import Passage
 from cable_rpc.study.metrics import ByteLayers, mask_overlap, roi_overlap, sent_coverage
 from cable_rpc.study.sequence_metrics import MeasuredFrame, frame_prefill
-from cable_rpc.study.tables.lane import Passage
 from cable_rpc.study.transport_estimate import TransportBytes, estimate_exchange
-from cable_rpc.types import BoolMask, Frame, GroundTruth, RoiMask
+from cable_rpc.types import BoolMask, Detections, Frame, GroundTruth, RoiMask, Segmentation
 
 
-def measured_frame(frame: Frame, passage: Passage, whole: Passage) -> MeasuredFrame:
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What the same models give of a frame that a strategy is held against."""
+
+    detections: Detections
+    """Weak ones included."""
+    mask: BoolMask
+    """bool [height, width]."""
+    segmentation: Segmentation | None = None
+    """For the prefill of whole frames; None where it isn't told."""
+    bytes_up: ByteLayers | None = None
+    """None where nothing was sent."""
+
+    @classmethod
+    def sent_whole(cls, passage: Passage) -> Reference:
+        """The frame sent whole."""
+        return cls(passage.detections, passage.segmentation.mask, passage.segmentation, bytes_up(passage))
+
+
+def measured_frame(frame: Frame, passage: Passage, reference: Reference) -> MeasuredFrame:
     """Put together what one frame came to.
 
     Args:
         frame: as the source gave it.
         passage: its way under the strategy.
-        whole: its way sent whole, by the same models.
+        reference: what it is held against.
     """
     proposal = passage.prepared.proposal
     sent = passage.prepared.sent_region
@@ -35,16 +54,38 @@ def measured_frame(frame: Frame, passage: Passage, whole: Passage) -> MeasuredFr
         staleness=proposal.staleness,
         truth=without_masks(truth),
         detections=passage.detections,
-        full_detections=whole.detections,
+        full_detections=reference.detections,
         overlap_roi=roi_overlaps(proposal, truth, frame.size_hw),
         overlap_sent=None if truth is None else roi_overlap(truth.boxes_xyxy, sent.pixels()),
-        mask_overlap=mask_overlap(passage.segmentation.mask, whole.segmentation.mask),
+        mask_overlap=mask_overlap(passage.segmentation.mask, reference.mask),
         bytes_up=bytes_up(passage),
         bytes_down=bytes_down(passage),
-        full_bytes_up=bytes_up(whole),
+        full_bytes_up=reference.bytes_up,
         stage_ns=stages,
         end_to_end_ns=sum(stages.values()),
-        prefill=frame_prefill(passage.segmentation, whole.segmentation),
+        prefill=frame_prefill(passage.segmentation, reference.segmentation),
+    )
+
+
+def dropped_frame(frame: Frame, reference: Reference) -> MeasuredFrame:
+    """A frame that was never sent: nothing of it arrived, and nothing was found in it."""
+    truth, nothing = frame.truth, ByteLayers(0, 0, 0, 0)
+    none_of_it = None if truth is None else np.zeros(len(truth), np.float64)
+    return MeasuredFrame(
+        index=frame.index,
+        keyframe=False,
+        coverage_roi=None,
+        coverage_tx=0.0,
+        staleness=None,
+        truth=without_masks(truth),
+        detections=Detections.empty(),
+        full_detections=reference.detections,
+        overlap_roi=none_of_it,
+        overlap_sent=none_of_it,
+        mask_overlap=mask_overlap(np.zeros(frame.size_hw, np.bool_), reference.mask),
+        bytes_up=nothing,
+        bytes_down=nothing,
+        full_bytes_up=reference.bytes_up,
     )
 
 

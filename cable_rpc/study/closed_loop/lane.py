@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cable_codecs import CodecParameters, RegionTreatment
 
@@ -14,10 +14,13 @@ from cable_rpc.edge.client import SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder, PreparedFrame
 from cable_rpc.edge.strategy import RoiStrategy
 from cable_rpc.errors import RemoteError
-from cable_rpc.study.tables.models import LoadedModels
-from cable_rpc.study.tables.session_in_process import SessionInProcess
+from cable_rpc.study.closed_loop.models import LoadedModels
+from cable_rpc.study.closed_loop.session_in_process import SessionInProcess
 from cable_rpc.types import Detections, Image, Segmentation
 from cable_rpc.wire.answers import FrameAnswer
+from cable_rpc.wire.v1 import perception_pb2 as pb
+
+NOMINAL_DURATION_NS = 5_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,11 @@ class LaneSettings:
     treatment: RegionTreatment
     prompt: str
     min_score: float
+    bitrate_kbps: int | None = None
+    """Target of the codec's rate control, in place of a quality."""
+    nominal_times: bool = False
+    """Messages carry nominal durations and the source's own stamps, so that equal settings give equal bytes: numbers
+    take more bytes the larger they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +80,11 @@ class Lane:
         width, height = source.size_wh
         self._keeper = models.keeper
         self._stack = AsyncExitStack()
-        self._encoder = FrameEncoder(
-            strategy, CodecParameters(settings.codec, width, height, source.fps, settings.quality), settings.treatment
+        parameters = CodecParameters(
+            settings.codec, width, height, source.fps, settings.quality, bitrate_kbps=settings.bitrate_kbps
         )
+        self._encoder = FrameEncoder(strategy, parameters, settings.treatment)
+        self._nominal_times = settings.nominal_times
         self._stack.callback(self._encoder.close)
         request = SessionRequest(
             codec=settings.codec,
@@ -86,7 +96,7 @@ class Lane:
             min_score=settings.min_score,
             treatment=settings.treatment,
         )
-        self._session = SessionInProcess(models.perception, request)
+        self._session = SessionInProcess(models.perception, request, nominal_times=settings.nominal_times)
 
     async def __aenter__(self) -> Lane:
         async with self._stack:
@@ -105,20 +115,47 @@ class Lane:
             FrameError: the session could not process the frame.
             RemoteError: the session closed, or answered without a mask.
         """
+        passage = await self.send(captured)
+        return replace(passage, apply_ns=self.apply(passage))
+
+    async def send(self, captured: CapturedFrame) -> Passage:
+        """Takes one frame to the cloud and back, and leaves the answer to `apply`.
+
+        Raises:
+            CodecError: encoding failed.
+            FrameError: the session could not process the frame.
+            RemoteError: the session closed, or answered without a mask.
+        """
         prepared = self._encoder.prepare(captured, force_keyframe=False)
         # As the client stamps it; the stamp is part of the message's size.
         prepared.message.send_time_ns = time.monotonic_ns()
-        strategy = self._encoder.strategy
-        strategy.sent(prepared.index, prepared.uplink_message_bytes)
+        if self._nominal_times:
+            set_nominal_times(prepared.message, captured.frame.capture_time_ns)
+        self._encoder.strategy.sent(prepared.index, prepared.uplink_message_bytes)
         answer = await self._session.exchange(prepared.message)
-        segmentation, picture = answer.segmentation, self._keeper.picture
-        if segmentation is None or picture is None:
+        picture = self._keeper.picture
+        if answer.segmentation is None or picture is None:
             raise RemoteError(f"frame {prepared.index} was answered without a mask")
+        return Passage(prepared, answer, answer.segmentation, self._keeper.newest, picture, 0)
+
+    def apply(self, passage: Passage) -> int:
+        """Tells the strategy what the cloud answered, each frame once, in order.
+
+        Returns:
+            What it took, in ns.
+        """
         started_ns = time.monotonic_ns()
-        strategy.update(
-            answer.sequence,
-            segmentation.mask,
-            confidence=segmentation.confidence,
-            uncertainty=segmentation.uncertainty,
+        self._encoder.strategy.update(
+            passage.answer.sequence,
+            passage.segmentation.mask,
+            confidence=passage.segmentation.confidence,
+            uncertainty=passage.segmentation.uncertainty,
         )
-        return Passage(prepared, answer, segmentation, self._keeper.newest, picture, time.monotonic_ns() - started_ns)
+        return time.monotonic_ns() - started_ns
+
+
+def set_nominal_times(message: pb.VideoFrame, capture_time_ns: int) -> None:
+    """Stamps of the source's clock, and durations as long as they usually are."""
+    message.capture_time_ns = message.send_time_ns = capture_time_ns
+    timing = message.timing
+    timing.capture_ns = timing.roi_ns = timing.fill_ns = timing.encode_ns = NOMINAL_DURATION_NS

@@ -1,7 +1,8 @@
-"""The models of a table's cells, loaded once for each process."""
+"""The models of a measured loop, loaded once for each process."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -9,9 +10,19 @@ from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segment
 from cable_rpc.cloud.model_runner import ThreadModelRunner
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.closed_loop.score_keeper import WEAKEST_SCORE, ScoreKeeper
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE
-from cable_rpc.study.tables.score_keeper import WEAKEST_SCORE, ScoreKeeper
-from cable_rpc.study.tables.settings import RunSettings
+
+
+@dataclass(frozen=True, slots=True)
+class ModelChoice:
+    """Which models answer the frames."""
+
+    segmenter: str = "embedded"
+    detector: str = "embedded"
+    device: str = "auto"
+    threads: int = 1
+    """CPU threads of each model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,18 +40,21 @@ class LoadedModels:
         return detector, segmenter
 
 
+ModelLoader = Callable[[ModelChoice], LoadedModels]
+
+
 @lru_cache(maxsize=1)
-def load_models(settings: RunSettings) -> LoadedModels:
-    """Load what the settings name.
+def load_models(choice: ModelChoice) -> LoadedModels:
+    """Load what is named.
 
     Raises:
         ConfigurationError: unknown back end, or its extra is not installed.
         ModelError: a model can't be loaded.
     """
-    options = BackendOptions(settings.device, settings.threads, WEAKEST_SCORE)
+    options = BackendOptions(choice.device, choice.threads, WEAKEST_SCORE)
     try:
-        keeper = ScoreKeeper(load_detector(settings.detector, options), OPERATING_SCORE)
-        segmenter = load_segmenter(settings.segmenter, options)
+        keeper = ScoreKeeper(load_detector(choice.detector, options), OPERATING_SCORE)
+        segmenter = load_segmenter(choice.segmenter, options)
     except ModuleNotFoundError as error:
         raise ConfigurationError(f"{error.name} is missing: pip install 'cable-rpc[cloud,study]'") from error
     runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
