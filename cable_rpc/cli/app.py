@@ -17,8 +17,10 @@ from cable_rpc.cli.doctor import doctor
 from cable_rpc.cli.export import export_app
 from cable_rpc.cli.figure import figure
 from cable_rpc.cli.inspect import inspect
+from cable_rpc.cli.report import report
 from cable_rpc.cli.serve import serve
 from cable_rpc.cli.stream import stream
+from cable_rpc.cli.sweep import sweep
 from cable_rpc.cli.tables import tables
 from cable_rpc.cli.train import train_app
 from cable_rpc.cli.train_segmenter import segmenter
@@ -40,6 +42,8 @@ app.command()(inspect)
 app.command()(figure)
 app.command()(codec_study)
 app.command()(tables)
+app.command()(report)
+app.command()(sweep)
 app.command()(doctor)
 app.add_typer(verify_app, name="verify")
 app.add_typer(export_app, name="export")

@@ -39,6 +39,8 @@ class FrameContext:
     """The detector's boxes of the same picture."""
     stream: str = ""
     """Which camera's session it belongs to, for what a back end keeps from frame to frame; "" = none in particular."""
+    doubtful: Detections | None = None
+    """Those that the session doesn't ask for because their score is too low, as far as the detector tells them."""
 
 
 class Detector(Protocol):

@@ -9,9 +9,9 @@ import hashlib
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from cable_models import ModelError as DetectorLoadError
 from cable_models import embedded_detector_path
@@ -22,7 +22,7 @@ from cable_models.rtdetr.file_plan import OPSET, FilePlan, GraphOptions
 from cable_models.rtdetr.onnx_detector import ROAD_USER_CLASSES
 
 from cable_rpc.cloud.backends import BackendOptions
-from cable_rpc.cloud.spec_options import options_text, read_options
+from cable_rpc.cloud.spec_options import meaning, options_text, read_options
 from cable_rpc.data.synthetic import SyntheticConfig, SyntheticSource
 from cable_rpc.errors import ConfigurationError, ModelError
 from cable_rpc.types import BoolMask, Detections, Image
@@ -30,11 +30,6 @@ from cable_rpc.types import BoolMask, Detections, Image
 log = logging.getLogger(__name__)
 
 VERIFIED_SEED, VERIFIED_FRAMES = 7, 2
-
-
-def meaning(text: str, default: Any = None) -> Any:
-    """A field with its explanation; without a default, the server's flag or the file decides."""
-    return field(default=default, metadata={"help": text})
 
 
 @dataclass(frozen=True, slots=True)

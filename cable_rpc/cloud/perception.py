@@ -80,8 +80,9 @@ class PerceptionModels:
             stream: the camera's session.
         """
         detected = await self._detector_runner.infer(lambda: _detect(self.detector, image, roi))
-        detections = detected.value.select(detected.value.scores >= min_score)
-        context = FrameContext(sequence, detections, stream)
+        asked_for = detected.value.scores >= min_score
+        detections = detected.value.select(asked_for)
+        context = FrameContext(sequence, detections, stream, detected.value.select(~asked_for))
         segmented = await self._segmenter_runner.infer(
             lambda: _inside(self.segmenter, image, roi, prompt or DEFAULT_PROMPT, context)
         )

@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import types
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, field, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 from urllib.parse import parse_qsl
 
 from cable_rpc.errors import ConfigurationError
 
 INTEGERS = tuple[int, ...]
+
+
+def meaning(text: str, default: Any = None) -> Any:
+    """A field with its explanation; without a default, the server's flag or the file decides."""
+    return field(default=default, metadata={"help": text})
 
 
 def read_options(spec: str, query: str, *kinds: type) -> list[dict[str, Any]]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass
 from pathlib import Path
 
-from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.language_table import PREFILL_COLUMNS, language_rows, prefill_rows, speedup_texts
+from cable_rpc.study.report_page import Tile, in_script, jpeg_uri, render_page, study_extra_missing
 from cable_rpc.study.run_record import (
     FRAMES_FILE,
     REPORT_FILE,
@@ -21,15 +20,6 @@ from cable_rpc.study.run_record import (
 )
 from cable_rpc.study.summary import RunSummary, honesty_notes, summarise
 from cable_rpc.study.summary_table import layer_label, percent, quality_rows, whole
-
-
-@dataclass(frozen=True, slots=True)
-class Tile:
-    """A headline figure."""
-
-    label: str
-    value: str
-    detail: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,20 +41,15 @@ def write_report(run_dir: Path) -> Path:
         ConfigurationError: the folder holds no run, or the ``study`` extra is not installed.
     """
     try:
-        from jinja2 import Environment, PackageLoader, select_autoescape
-        from plotly.offline import get_plotlyjs
-
         from cable_rpc.study.report_plots import plots_of
     except ImportError as error:
-        raise ConfigurationError(f"the report needs {error.name}: pip install 'cable-rpc[study]'") from error
+        raise study_extra_missing(error) from error
     records = read_frames(run_dir / FRAMES_FILE)
     info = read_run_info(run_dir / SUMMARY_FILE)
     summary = summarise(records, info)
-    page = Environment(
-        loader=PackageLoader("cable_rpc.study", "."), autoescape=select_autoescape(default=True)
-    ).get_template("report.html.j2")
     path = run_dir / REPORT_FILE
-    text = page.render(
+    text = render_page(
+        "report.html.j2",
         title=f"{info.source} · {info.codec} {info.quality} · {info.strategy}",
         info=info,
         summary=summary,
@@ -76,12 +61,9 @@ def write_report(run_dir: Path) -> Path:
         prefill=prefill_rows(summary),
         notes=honesty_notes(summary),
         environment=environment_rows(info),
-        plots=[
-            (plot, plot.figure.to_json(engine="json").replace("</", "<\\/")) for plot in plots_of(records, info.fps)
-        ],
+        plots=[(plot, in_script(plot.figure.to_json(engine="json"))) for plot in plots_of(records, info.fps)],
         stills=still_pairs(run_dir / STILLS_FOLDER),
         video=VIDEO_FILE if (run_dir / VIDEO_FILE).exists() else None,
-        plotly_js=get_plotlyjs().replace("</script>", "<\\/script>"),
     )
     write_text(path, text)
     return path
@@ -166,10 +148,6 @@ def still_pairs(folder: Path) -> list[StillPair]:
     for camera in sorted(folder.glob("*_camera.jpg")):
         received = camera.with_name(camera.name.replace("_camera", "_received"))
         if received.exists():
-            pairs.append(StillPair(int(camera.name.split("_")[0]), data_uri(camera), data_uri(received)))
+            pictures = (jpeg_uri(path.read_bytes()) for path in (camera, received))
+            pairs.append(StillPair(int(camera.name.split("_")[0]), *pictures))
     return pairs
-
-
-def data_uri(path: Path) -> str:
-    """A JPEG file as a data URI."""
-    return "data:image/jpeg;base64," + base64.b64encode(path.read_bytes()).decode("ascii")

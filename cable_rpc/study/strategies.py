@@ -26,6 +26,9 @@ STRATEGIES = {
 }
 """Name to a short description."""
 
+EDGE_MIN_SCORE = 0.2
+"""Score from which an edge detector's box is sent: a doubtful object is worth its bytes, the cloud decides."""
+
 
 def open_strategy(name: str, config: RoiConfig, block_size: int = 8, *, keep_steps: bool = False) -> RoiStrategy:
     """A fresh strategy for one stream.
@@ -42,7 +45,9 @@ def open_strategy(name: str, config: RoiConfig, block_size: int = 8, *, keep_ste
     """
     kind, _, argument = name.partition(":")
     if kind == "edge-boxes" and argument:
-        return BoxRegions(detector_boxes(load_detector(argument, BackendOptions())), block_size=block_size)
+        return BoxRegions(
+            detector_boxes(load_detector(argument, BackendOptions(min_score=EDGE_MIN_SCORE))), block_size=block_size
+        )
     if name == "cable":
         return RoiTracker(config, block_size, keep_steps=keep_steps)
     if name == "no-corridor":

@@ -62,6 +62,9 @@ class CodecParameters:
     background_offset: float = 0.0
     """Video: how much coarser pixels outside the region are quantised, 0..1 as a share of the quantiser scale, where
     `Encoder.encode` is given a region. Only libx264, libx265 and libvpx-vp9 can do so."""
+    size_offset: float = 0.0
+    """How much coarser a connected piece of the region is quantised for each doubling of its size, 0..0.5, up to
+    ``background_offset`` (`cable_codecs.size_offset`)."""
     intra_refresh: bool = False
     """Only libx264: renew the picture column by column instead of by keyframes after the first, so that no packet is
     much larger than others. A decoder that lost a packet still needs a keyframe, made on demand."""

@@ -29,6 +29,7 @@ from cable_codecs.base import BoolMask
 from cable_codecs.errors import CodecError
 from cable_codecs.region_grid import grow_to_grid
 from cable_codecs.region_rectangles import Rectangle, covering_rectangles
+from cable_codecs.size_offset import check_size_offset, sized_rectangles
 
 MACROBLOCK = 16
 """Side in pixels of the squares that x264 gives one offset each."""
@@ -171,6 +172,7 @@ class OffsetAttacher:
         pixel_format: str = "yuv420p",
         most_rectangles: int = DEFAULT_RECTANGLES,
         in_place: bool = True,
+        size_offset: float = 0.0,
     ) -> None:
         """Prepare for one picture size.
 
@@ -181,15 +183,19 @@ class OffsetAttacher:
             pixel_format: Of the frames.
             most_rectangles: Beyond these a region is covered by fewer, larger ones.
             in_place: Overwrite records where that is found safe.
+            size_offset: How much coarser a piece of the region is quantised for each doubling of its side
+                (`cable_codecs.size_offset`).
 
         Raises:
             CodecError: A value outside its range, or this FFmpeg has no ``addroi`` filter.
         """
         check_offset(offset)
+        check_size_offset(size_offset, offset)
         if most_rectangles < 1:
             raise CodecError(f"most_rectangles must be at least 1, got {most_rectangles}")
         self.height, self.width = height, width
         self.offset = offset
+        self.size_offset = size_offset
         self.pixel_format = pixel_format
         self.most_rectangles = most_rectangles
         self.in_place = in_place and records_lie_as_expected()
@@ -216,8 +222,7 @@ class OffsetAttacher:
             raise CodecError(
                 f"the region must be bool and at most [{self.height}, {self.width}], got {roi.dtype} {list(roi.shape)}"
             )
-        rectangles = region_rectangles(roi, self.most_rectangles)
-        regions = regions_of(rectangles, self.offset, self.height, self.width)
+        regions = self.regions_of(roi)
         if not self.in_place:
             if regions != self.regions:
                 self.graph = build_graph(self.width, self.height, self.pixel_format, regions)
@@ -228,6 +233,14 @@ class OffsetAttacher:
         spare = [regions[-1]] * (self.most_rectangles + 1 - len(regions))
         overwrite(attached, records([*regions, *spare]))
         return attached
+
+    def regions_of(self, roi: BoolMask) -> Regions:
+        """The region's rectangles with their offsets, then the whole picture."""
+        if not self.size_offset:
+            rectangles = region_rectangles(roi, self.most_rectangles)
+            return regions_of(rectangles, self.offset, self.height, self.width)
+        pieces = sized_rectangles(roi, self.size_offset, self.offset, self.most_rectangles, MACROBLOCK)
+        return [*pieces, (Rectangle(0, self.height, 0, self.width), self.offset)]
 
 
 def overwrite(frame: VideoFrame, content: bytes) -> None:

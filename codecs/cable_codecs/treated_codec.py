@@ -36,7 +36,13 @@ def coded_parameters(parameters: CodecParameters, treatment: RegionTreatment) ->
     """
     treatment.check_codec(parameters.name, stateless=parameters.name in STILL_CODECS)
     height, width = uploaded_size(parameters.height, parameters.width, treatment.scale)
-    return replace(parameters, height=height, width=width, background_offset=treatment.quantiser_offset)
+    return replace(
+        parameters,
+        height=height,
+        width=width,
+        background_offset=treatment.quantiser_offset,
+        size_offset=treatment.size_offset,
+    )
 
 
 class TreatedEncoder:

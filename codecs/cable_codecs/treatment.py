@@ -18,6 +18,7 @@ from cable_codecs.feather import check_feather
 from cable_codecs.fill import FillMode, check_fill_mode
 from cable_codecs.hysteresis import check_hysteresis
 from cable_codecs.quantiser_offset import check_offset
+from cable_codecs.size_offset import check_size_offset
 from cable_codecs.upload_scale import (
     Interpolation,
     check_scale,
@@ -63,6 +64,9 @@ class RegionTreatment:
     quantiser_offset: float = 0.0
     """Coarser quantisation outside the region, 0..1 as a share of the quantiser scale; needs an encoder that heeds it
     (`quantiser_offset.require_offsets`), and makes most sense with ``fill="keep"``."""
+    size_offset: float = 0.0
+    """How much coarser each connected piece of the region is quantised for each doubling of its size, 0..0.5, up to
+    ``quantiser_offset``: large objects are found at a coarse quantiser too (`cable_codecs.size_offset`)."""
 
     def __post_init__(self) -> None:
         check_fill_mode(self.fill)
@@ -75,6 +79,7 @@ class RegionTreatment:
         check_crop_mode(self.crop)
         check_scale(self.scale, self.interpolation)
         check_offset(self.quantiser_offset)
+        check_size_offset(self.size_offset, self.quantiser_offset)
         if self.feather_px and self.fill in ("freeze", "keep"):
             raise CodecError(
                 f"a feathered edge fades into a fill, but {self.fill!r} has none of its own; use feather_px=0"

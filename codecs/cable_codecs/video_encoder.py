@@ -46,7 +46,12 @@ class VideoEncoder(Encoder):
         self.to_picture = BgrToI420(parameters.height, parameters.width, full_range=False, coded=coded)
         self.attacher: OffsetAttacher | None = None
         if parameters.background_offset > 0:
-            self.attacher = OffsetAttacher(*coded, parameters.background_offset, pixel_format=self.spec.pixel_format)
+            self.attacher = OffsetAttacher(
+                *coded,
+                parameters.background_offset,
+                pixel_format=self.spec.pixel_format,
+                size_offset=parameters.size_offset,
+            )
             self.everything: BoolMask = np.ones(coded, np.bool_)
         self.frame_count = 0
 

@@ -57,6 +57,21 @@ def test_each_pixel_is_as_sure_as_the_best_of_its_boxes(rows: list[tuple[float, 
             assert found.uncertainty[y, x] == (round(255 * (1 - max(here))) if here else 0)
 
 
+def test_doubtful_boxes_join_the_mask_from_the_score_that_is_asked_for() -> None:
+    boxes = np.array([[0, 0, 2, 2], [4, 0, 6, 2], [8, 0, 10, 2]], np.float32)
+    found = Detections(boxes, np.full(3, 2, np.int32), np.array([0.8, 0.3, 0.1], np.float32))
+    context = FrameContext(0, found.select(np.array([0])), doubtful=found.select(np.array([1, 2])))
+    image, whole = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.ones((HEIGHT, WIDTH), np.bool_)
+    for spec, corners in (("boxes", [0]), ("boxes?min_score=0.2", [0, 4]), ("boxes?min_score=0.05", [0, 4, 8])):
+        answer = load_segmenter(spec, BackendOptions()).segment(image, whole, "", context)
+        assert np.flatnonzero(answer.mask[0]).tolist() == [x + dx for x in corners for dx in (0, 1)]
+        assert answer.confidence == pytest.approx(0.8)
+    with pytest.raises(ConfigurationError, match=r"min_score must be 0\.\.1"):
+        load_segmenter("boxes?min_score=2", BackendOptions())
+    with pytest.raises(ConfigurationError, match="no argument"):
+        load_segmenter("boxes:file", BackendOptions())
+
+
 def test_oracle_answers_with_the_world_s_own_masks() -> None:
     oracle = load_segmenter("oracle:synthetic:3", BackendOptions())
     frame = SyntheticSource(SyntheticConfig(seed=3)).frame(2)

@@ -79,7 +79,7 @@ class WholeFrameSegmenter(BoxSegmenter):
 
 
 def cheap_models(choice: ModelChoice, segmenter: BoxSegmenter | None = None) -> LoadedModels:
-    keeper = ScoreKeeper(TileDetector(), 0.4)
+    keeper = ScoreKeeper(TileDetector())
     runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
     return LoadedModels(PerceptionModels(keeper, segmenter or BoxSegmenter(), *runners), keeper)
 
@@ -170,12 +170,13 @@ def test_the_reference_stays_h264_where_regions_are_jpeg() -> None:
     assert jpeg.layer("bitstream").up_per_frame > h264.up_per_frame
 
 
-def test_weak_detections_reach_average_precision_only() -> None:
-    keeper = ScoreKeeper(TileDetector(), 0.4)
+async def test_weak_detections_reach_average_precision_and_are_not_answered() -> None:
+    models = cheap_models(SETTINGS.models)
     image = next(iter(open_source("synthetic:11", max_frames=1, size=(160, 96)))).image
-    (passed,) = keeper.detect([image])
-    assert 0 < len(passed) < len(keeper.newest)
-    assert passed.scores.min() >= 0.4 > keeper.newest.scores.min()
+    answer = await models.perception.perceive(image, None, prompt="", min_score=0.4, sequence=0)
+    kept = models.keeper.newest
+    assert 0 < len(answer.detections) < len(kept)
+    assert answer.detections.scores.min() >= 0.4 > kept.scores.min()
 
 
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,6 @@ from cable_rpc.cloud.model_runner import ThreadModelRunner
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.closed_loop.score_keeper import WEAKEST_SCORE, ScoreKeeper
-from cable_rpc.study.sequence_metrics import OPERATING_SCORE
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +52,7 @@ def load_models(choice: ModelChoice) -> LoadedModels:
     """
     options = BackendOptions(choice.device, choice.threads, WEAKEST_SCORE)
     try:
-        keeper = ScoreKeeper(load_detector(choice.detector, options), OPERATING_SCORE)
+        keeper = ScoreKeeper(load_detector(choice.detector, options))
         segmenter = load_segmenter(choice.segmenter, options)
     except ModuleNotFoundError as error:
         raise ConfigurationError(f"{error.name} is missing: pip install 'cable-rpc[cloud,study]'") from error

@@ -1,4 +1,4 @@
-"""A detector whose weak detections are remembered for average precision, and kept from everyone else."""
+"""A detector whose last detections are remembered, weak ones included, which average precision needs."""
 
 from __future__ import annotations
 
@@ -12,16 +12,14 @@ WEAKEST_SCORE = 0.05
 
 
 class ScoreKeeper:
-    """Passes on what a detector is sure of, as it would answer with that threshold, and keeps all it found.
+    """Passes on what a detector finds, and keeps it; a session drops what is weaker than it asks for.
 
     Args:
         detector: opened with a threshold of `WEAKEST_SCORE`.
-        min_score: the threshold of what is passed on.
     """
 
-    def __init__(self, detector: Detector, min_score: float) -> None:
+    def __init__(self, detector: Detector) -> None:
         self._detector = detector
-        self._min_score = min_score
         self.name = detector.name
         self.revision = detector.revision
         self.device = detector.device
@@ -43,4 +41,4 @@ class ScoreKeeper:
     def _kept(self, images: Sequence[Image], found: list[Detections]) -> list[Detections]:
         if found:
             self.newest, self.picture = found[-1], images[-1]
-        return [one.select(one.scores >= self._min_score) for one in found]
+        return found

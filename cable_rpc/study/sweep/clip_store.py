@@ -20,8 +20,8 @@ import numpy as np
 
 from cable_rpc.data.source import open_source
 from cable_rpc.errors import ConfigurationError, SourceError
+from cable_rpc.study.digests import source_stamp
 from cable_rpc.study.sweep.cell import ClipRequest
-from cable_rpc.study.tables.identity import file_stamp as source_stamp
 from cable_rpc.types import CameraIntrinsics, CameraMount, EgoMotion, Frame, GroundTruth
 
 META_FILE, FRAMES_FILE, TRUTH_FILE = "clip.json", "frames.bgr", "truth.npz"
@@ -103,7 +103,7 @@ def clip_key(request: ClipRequest) -> str:
         request.fps,
         request.size,
         request.max_frames,
-        source_stamp(request.source.partition(":")[2]),
+        source_stamp(request.source),
     ]
     return "clip-" + hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 

@@ -17,10 +17,11 @@ import numpy as np
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.closed_loop.measured_frame import Reference
 from cable_rpc.study.closed_loop.models import LoadedModels, ModelLoader, load_models
+from cable_rpc.study.digests import weights_digest
 from cable_rpc.study.sequence_metrics import OPERATING_SCORE
 from cable_rpc.study.sweep.cell import ClipRequest, TruthChoice
 from cable_rpc.study.sweep.clip_store import StoredClip, stored_clip
-from cable_rpc.study.tables.identity import code_digest, weights_digest
+from cable_rpc.study.sweep.identity import measuring_code
 from cable_rpc.types import COCO_ROAD_USERS, BoolMask, Detections, Frame, GroundTruth
 
 
@@ -102,7 +103,7 @@ def reference_key(request: ClipRequest) -> str:
         request.prompt,
         weights_digest(models.detector, detector=True),
         weights_digest(models.segmenter, detector=False),
-        code_digest(),
+        measuring_code(),
     ]
     return "reference-" + hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import cable_rpc
 from cable_rpc.study import digests
-from cable_rpc.study.digests import weights_digest as weights_digest
 from cable_rpc.study.tables.settings import RunSettings, SequenceRequest
 
 KEY_DIGITS = 20
@@ -49,8 +48,8 @@ def cell_identity(request: SequenceRequest, strategy: str, settings: RunSettings
         "settings": json.loads(json.dumps(run)),
         "version": cable_rpc.__version__,
         "code": code_digest(),
-        "detector_weights": weights_digest(settings.detector, detector=True),
-        "segmenter_weights": weights_digest(settings.segmenter, detector=False),
+        "detector_weights": digests.weights_digest(settings.detector, detector=True),
+        "segmenter_weights": digests.weights_digest(settings.segmenter, detector=False),
     }
 
 
@@ -62,8 +61,3 @@ def cell_key(identity: dict[str, Any]) -> str:
 def code_digest() -> str:
     """Of the sources that a table's measurement goes through."""
     return digests.code_digest(MEASURING_PARTS)
-
-
-def file_stamp(rest: str) -> list[int]:
-    """`digests.source_stamp` of what follows a source's scheme."""
-    return digests.source_stamp(f"video:{rest}")

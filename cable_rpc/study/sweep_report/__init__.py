@@ -1,0 +1,69 @@
+"""The report of a sweep: one HTML file, and figures and tables for papers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.metrics import Bootstrap
+from cable_rpc.study.report_page import study_extra_missing
+from cable_rpc.study.run_record import REPORT_FILE, write_text
+from cable_rpc.study.sweep.qualities import find_quality
+from cable_rpc.study.sweep.run_folder import SweepRun
+from cable_rpc.study.sweep_report.methods import anchors_of, cells_by_method, method_styles
+
+EXPORT_FOLDER = "export"
+
+
+def write_sweep_report(
+    run: SweepRun,
+    *,
+    quality: str | None = None,
+    anchor: str | None = None,
+    bootstrap: Bootstrap | None = None,
+    export: bool = True,
+) -> Path:
+    """Write ``report.html`` into the run's folder, and figures and tables for papers below it.
+
+    Args:
+        run: measured cells and what they were measured with.
+        quality: that the report opens with; the configuration's first by default. The configuration's others follow.
+        anchor: whole label of the method that all others are compared with; by default the configuration's anchor, at
+            the frame rate of each method.
+        bootstrap: how intervals are drawn; None for none.
+        export: whether ``export/`` is written.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        ConfigurationError: no cell was measured, the quality or anchor is unknown, a file can't be written, or the
+            ``study`` extra is not installed.
+    """
+    try:
+        from cable_rpc.study.sweep_report.content import gather
+        from cable_rpc.study.sweep_report.exports import write_exports
+        from cable_rpc.study.sweep_report.page import page_text
+    except ImportError as error:
+        raise study_extra_missing(error) from error
+    methods = cells_by_method(run.cells)
+    if not methods:
+        failed = f"; the first says: {run.cells[0].error}" if run.cells else ""
+        raise ConfigurationError(
+            f"{run.folder} has no measured cell to report, {len(run.cells)} failed and {run.missing} were not "
+            f"tried{failed}"
+        )
+    names = tuple(dict.fromkeys([quality] if quality else []) | dict.fromkeys(run.qualities))
+    for name in names:
+        find_quality(name)
+    compared = anchors_of(methods, anchor or run.anchor, for_all=anchor is not None)
+    anchors = tuple(dict.fromkeys(label for label in compared.values() if label))
+    content = gather(run, methods, compared, method_styles(tuple(methods), anchors), names, bootstrap)
+    path = run.folder / REPORT_FILE
+    try:
+        write_text(path, page_text(content))
+        if export:
+            write_exports(content, run.folder / EXPORT_FOLDER)
+    except OSError as error:
+        raise ConfigurationError(f"can't write the report into {run.folder}: {error.strerror or error}") from error
+    return path

@@ -1,0 +1,96 @@
+"""What a report needs of the methods of a sweep: order, anchor, looks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from cable_rpc.errors import ConfigurationError
+from cable_rpc.study.report_plots import GREY
+from cable_rpc.study.sweep.cell import MeasuredCell, SweepCell
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d4f")
+"""Okabe and Ito, "Color Universal Design" (2008), without black and yellow, which vanish on one page or the other."""
+SHAPES = (
+    ("square", "s", "■"),
+    ("diamond", "D", "◆"),
+    ("triangle-up", "^", "▲"),
+    ("triangle-down", "v", "▼"),
+    ("pentagon", "p", "⬟"),
+    ("star", "*", "★"),
+    ("cross", "P", "✚"),
+    ("x", "X", "✖"),
+    ("hexagon", "h", "⬢"),
+)
+"""A marker by its names in Plotly and Matplotlib, and as a character. Their numbers have no common divisor, so that 63
+methods differ."""
+ANCHOR_SHAPE = ("circle", "o", "●")
+
+
+@dataclass(frozen=True, slots=True)
+class MethodStyle:
+    """How one method is drawn everywhere."""
+
+    label: str
+    colour: str
+    symbol: str
+    """Plotly's name of the marker."""
+    marker: str
+    """Matplotlib's."""
+    glyph: str
+
+
+def method_styles(labels: Sequence[str], anchors: Sequence[str]) -> dict[str, MethodStyle]:
+    """A style for each method, in their order; anchors are grey circles."""
+    styles: dict[str, MethodStyle] = {}
+    others = [label for label in labels if label not in anchors]
+    for label in labels:
+        if label in anchors:
+            styles[label] = MethodStyle(label, GREY, *ANCHOR_SHAPE)
+        else:
+            place = others.index(label)
+            styles[label] = MethodStyle(label, COLOURS[place % len(COLOURS)], *SHAPES[place % len(SHAPES)])
+    return styles
+
+
+def cells_by_method(cells: Sequence[MeasuredCell]) -> dict[str, tuple[MeasuredCell, ...]]:
+    """Measured cells of each method, in their order; failed ones and methods without any are left out."""
+    grouped: dict[str, list[MeasuredCell]] = {}
+    for measured in cells:
+        if measured.result is not None:
+            grouped.setdefault(measured.cell.method, []).append(measured)
+    return {label: tuple(members) for label, members in grouped.items()}
+
+
+def anchors_of(
+    methods: Mapping[str, Sequence[MeasuredCell]], anchor: str, *, for_all: bool = False
+) -> dict[str, str | None]:
+    """Which method each one is compared with; None for an anchor itself, and where there is none.
+
+    Thinning a drive saves bytes and costs no quality that is measured on the frames that remain, so a method is
+    compared with the anchor at its own frame rate, if there is one, and else with the first.
+
+    Args:
+        methods: measured cells by label.
+        anchor: label of a method, its frame rate left out.
+        for_all: the label is a method's whole one, and every other method is compared with that.
+
+    Raises:
+        ConfigurationError: ``for_all``, and there is no such method.
+    """
+    if for_all:
+        if anchor not in methods:
+            raise ConfigurationError(f"no method of this run is called '{anchor}'; choose of: {'; '.join(methods)}")
+        return {label: None if label == anchor else anchor for label in methods}
+    rates = {label: members[0].cell for label, members in methods.items()}
+    candidates = {cell.clip.fps: label for label, cell in rates.items() if without_rate(cell) == anchor}
+    first = next(iter(candidates.values()), None)
+    return {
+        label: None if label in candidates.values() else candidates.get(cell.clip.fps, first)
+        for label, cell in rates.items()
+    }
+
+
+def without_rate(cell: SweepCell) -> str:
+    """The method's label without its frame rate."""
+    return cell.method if cell.clip.fps is None else cell.method.replace(f" · {cell.clip.fps:g} fps", "", 1)
