@@ -13,7 +13,9 @@ from cable_rpc.study.sweep.cell import RegionQuality
 from cable_rpc.types import BoolMask, Float32Array, Image
 
 
-def region_fidelity(reference: Image, test: Image, regions: Sequence[BoolMask]) -> tuple[RegionQuality, ...]:
+def region_fidelity(
+    reference: Image, test: Image, regions: Sequence[BoolMask], *, with_ssim: bool = True
+) -> tuple[RegionQuality, ...]:
     """Squared error and SSIM of BT.601 luma in each region, as `cable_codecs.roi_psnr` and `roi_ssim` define them.
 
     Args:
@@ -21,13 +23,16 @@ def region_fidelity(reference: Image, test: Image, regions: Sequence[BoolMask]) 
         test: uint8 [height, width, 3], BGR, as the models saw it.
         regions: bool [height, width] each; an empty one counts for nothing, and one that has no pixel inside its rim
             has no SSIM.
+        with_ssim: False leaves SSIM out, which takes longer than all else.
     """
     first, second = luma(reference), luma(test)
-    similarity = ssim_map(first.astype(np.float32), second.astype(np.float32))
+    similarity = ssim_map(first.astype(np.float32), second.astype(np.float32)) if with_ssim else None
     return tuple(one_region(first, second, similarity, region) for region in regions)
 
 
-def one_region(first: Image, second: Image, similarity: npt.NDArray[np.float32], region: BoolMask) -> RegionQuality:
+def one_region(
+    first: Image, second: Image, similarity: npt.NDArray[np.float32] | None, region: BoolMask
+) -> RegionQuality:
     """The sums of one region of one frame."""
     inside = np.ascontiguousarray(region).view(np.uint8)
     pixels = int(cv2.countNonZero(inside))
@@ -35,7 +40,7 @@ def one_region(first: Image, second: Image, similarity: npt.NDArray[np.float32],
         return RegionQuality()
     error = float(cv2.norm(first, second, cv2.NORM_L2SQR, inside))
     valid = without_rim(region)
-    if not valid.any():
+    if similarity is None or not valid.any():
         return RegionQuality(1, pixels, error)
     return RegionQuality(1, pixels, error, float(cv2.mean(similarity, valid)[0]), 1)
 

@@ -119,7 +119,7 @@ QUALITIES: Mapping[str, Quality] = {
             "ssim_objects",
             "SSIM of objects",
             "",
-            "luma SSIM inside the boxes of all objects, sent or not; mean over frames",
+            "luma SSIM inside the boxes of all objects, sent or not; mean over every third frame",
             lambda result: ssim_parts(result.objects),
         ),
         Quality(
@@ -133,7 +133,7 @@ QUALITIES: Mapping[str, Quality] = {
             "ssim_sent",
             "SSIM of the region",
             "",
-            "luma SSIM inside what was sent, which differs from strategy to strategy",
+            "luma SSIM inside what was sent, which differs from strategy to strategy; mean over every third frame",
             lambda result: ssim_parts(result.sent),
         ),
     )
