@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.run_record import FRAMES_FILE, SUMMARY_FILE
@@ -64,9 +65,9 @@ def sweep_report(
     from cable_rpc.study.sweep_report import EXPORT_FOLDER, write_sweep_report
 
     bootstrap = Bootstrap(draws) if draws else None
-    path = write_sweep_report(
-        read_run(folder, store), quality=quality, anchor=anchor, bootstrap=bootstrap, export=export
-    )
+    sweep = read_run(folder, store)
+    with Console(stderr=True).status(f"comparing methods over {draws} draws of sequences"):
+        path = write_sweep_report(sweep, quality=quality, anchor=anchor, bootstrap=bootstrap, export=export)
     if export:
         print(f"wrote {folder / EXPORT_FOLDER}")
     return path

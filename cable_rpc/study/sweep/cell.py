@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from pathlib import PurePath
 from typing import Any, Literal, Self
 
 from cable_codecs import RegionTreatment
@@ -77,7 +78,8 @@ class SweepCell:
     @property
     def method(self) -> str:
         """Everything but the sequence and the rate point, for people: cells of equal method lie on one curve."""
-        parts = [self.strategy]
+        kind, separator, detector = self.strategy.partition(":")
+        parts = [f"{kind}{separator}{PurePath(detector).stem}"]
         if self.strategy != ANCHOR_STRATEGY:
             parts.append(self.treatment_label)
         parts.append(self.codec)

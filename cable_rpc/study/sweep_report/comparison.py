@@ -66,7 +66,9 @@ class MethodResult:
                 said += [f"{name}: {delta.reason}"] if delta.reason else []
                 said += delta.notes
         for one in self.levels:
-            said += [f"at {one.level:g} %: {one.rate.reason}"] if one.rate.reason else []
+            for figure in (one.rate, one.saving):
+                if figure is not None:
+                    said += [f"at {one.level:g} %: {text}" for text in (figure.reason, *figure.notes) if text]
         return tuple(dict.fromkeys(said))
 
 

@@ -75,14 +75,16 @@ def example_rows(methods: Mapping[str, Sequence[MeasuredCell]], anchors: Sequenc
 
 
 def common_rate(cells: Mapping[str, Sequence[MeasuredCell]], anchors: Sequence[str]) -> float:
-    """The rate of the anchor's cell beside which most methods have one of nearly equal rate; the lower of two such."""
+    """The rate of the anchor's cell beside which most methods have one of nearly equal rate; of several the middle."""
     label = next((label for label in anchors if label in cells), next(iter(cells)))
 
     def company(rate: float) -> int:
         return sum(any(distance(cell, rate) <= math.log(1 + NEARLY_EQUAL) for cell in own) for own in cells.values())
 
-    rates = [facts_of([cell]).rate_kbps for cell in cells[label]]
-    return max(rates, key=lambda rate: (company(rate), -rate))
+    rates = sorted(facts_of([cell]).rate_kbps for cell in cells[label])
+    most = max(map(company, rates))
+    best = [rate for rate in rates if company(rate) == most]
+    return best[(len(best) - 1) // 2]
 
 
 def distance(cell: MeasuredCell, rate_kbps: float) -> float:

@@ -29,6 +29,8 @@ from cable_rpc.study.tables.draw_markdown import draw_markdown
 
 COLUMN_IN, PAGE_IN = 3.5, 7.0
 """Widths of one column and of both."""
+PLOT_IN, LEGEND_LINE_IN = 2.9, 0.13
+"""Heights of a plot with its axes, and of one line of the legend."""
 SUFFIXES = (".png", ".pdf")
 PNG_DPI = 300
 STYLE: Any = {
@@ -65,15 +67,31 @@ def write_exports(content: ReportContent, folder: Path) -> None:
     write_text(folder / "curves.csv", curves_csv(content))
     for result in content.results:
         name = f"rate_quality_{result.quality.name}"
-        save(folder / name, COLUMN_IN, 3.4, partial(draw_curves, content=content, result=result))
-        save(folder / f"{name}_wide", PAGE_IN, 3.6, partial(draw_curves, content=content, result=result))
+        lines = len(result.methods)
+        save(
+            folder / name,
+            COLUMN_IN,
+            PLOT_IN + LEGEND_LINE_IN * lines,
+            partial(draw_curves, content=content, result=result),
+        )
+        save(
+            folder / f"{name}_wide",
+            PAGE_IN,
+            PLOT_IN + LEGEND_LINE_IN * (lines // 2 + 1),
+            partial(draw_curves, content=content, result=result),
+        )
     levelled = [result for result in content.results if result.quality.name == LEVELLED_QUALITY]
     if levelled:
         bars = byte_bars(levelled[0], content.methods, content.level)
         height = 1.1 + 0.34 * len(bars)
         save(folder / "byte_kinds", COLUMN_IN, height, lambda axes: draw_bytes(axes, bars))
     if byte_savings(content.methods):
-        save(folder / "pixels_bytes", COLUMN_IN, 3.4, lambda axes: draw_pixels(axes, content))
+        save(
+            folder / "pixels_bytes",
+            COLUMN_IN,
+            PLOT_IN + LEGEND_LINE_IN * len(content.methods),
+            lambda axes: draw_pixels(axes, content),
+        )
 
 
 def save(path: Path, width_in: float, height_in: float, draw: Callable[[Axes], None]) -> None:

@@ -37,7 +37,7 @@ def methods_table(result: QualityResult) -> PageTable:
     heading = ["method", "compared with"]
     levels = result.methods[0].levels if result.methods else ()
     for one in levels:
-        heading += [f"kbit/s at {one.level:g} %", f"saved at {one.level:g} %"]
+        heading += [f"kbit/s at {one.level:g}\u00a0%", f"saved at {one.level:g}\u00a0%"]
     unit = f", {result.quality.unit}" if result.quality.unit else ""
     heading += ["BD-rate, %", f"BD-quality{unit}", "overlap, %", "beaten points"]
     return PageTable(tuple(heading), tuple(method_row(one) for one in result.methods))
