@@ -3,8 +3,8 @@
 Bjontegaard, "Calculation of average PSNR differences between RD-curves", VCEG-M33 (2001), with the piecewise
 interpolators that later documents (JCTVC-B055, JVET-L0241) put in the place of its single cubic.
 
-Two rules keep the number from meaning nothing: a curve needs five points, and the curves must share half of the range
-that they span together. Where one is broken there is an error, never a number.
+Two rules keep the number from meaning nothing: a curve needs five points, three of them beaten by none, and the
+curves must share half of the range that they span together. Where one is broken there is an error, never a number.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ Interpolation = Literal["pchip", "akima", "cubic"]
 which bends away from curves of more than four points."""
 
 MIN_POINTS = 5
+MIN_UNDOMINATED = 3
+"""Of them, that others don't beat: measures of a task are noisy, and a curve of them is never smooth."""
 MIN_OVERLAP = 0.5
 
 Area = Callable[[float, float], float]
@@ -116,7 +118,7 @@ def bd_rate(
         test: What to judge.
         method: Interpolation.
         min_overlap: Share of the spanned qualities that the curves must have in common, 0..1.
-        min_points: Points that each curve needs after dominated ones are dropped.
+        min_points: Points that each curve needs; `MIN_UNDOMINATED` of them must be left when dominated ones are dropped.
 
     Raises:
         IncomparableCurvesError: Too few points, or too small an overlap.
@@ -159,7 +161,7 @@ def bd_quality(
         test: What to judge.
         method: Interpolation.
         min_overlap: Share of the spanned log rates that the curves must have in common, 0..1.
-        min_points: Points that each curve needs after dominated ones are dropped.
+        min_points: Points that each curve needs; `MIN_UNDOMINATED` of them must be left when dominated ones are dropped.
 
     Raises:
         IncomparableCurvesError: Too few points, or too small an overlap.
@@ -185,14 +187,18 @@ def usable(curve: RateQualityCurve, name: str, min_points: int) -> RateQualityCu
     """The curve without dominated points.
 
     Raises:
-        IncomparableCurvesError: Too few are left.
+        IncomparableCurvesError: Too few were measured, or are left.
     """
-    kept = curve.without_dominated()
-    if len(kept) < min_points:
-        dropped = len(curve) - len(kept)
-        beaten = f" once {dropped} beaten by others are dropped" if dropped else ""
+    if len(curve) < min_points:
         raise IncomparableCurvesError(
-            f"the {name} has {len(kept)} points{beaten}, {min_points} are needed; code at more qualities"
+            f"the {name} has {len(curve)} points, {min_points} are needed; code at more qualities"
+        )
+    kept = curve.without_dominated()
+    needed = min(MIN_UNDOMINATED, min_points)
+    if len(kept) < needed:
+        raise IncomparableCurvesError(
+            f"the {name} has {len(kept)} points once {len(curve) - len(kept)} beaten by others are dropped, "
+            f"{needed} are needed; code at more qualities"
         )
     return kept
 

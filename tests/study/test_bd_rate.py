@@ -141,8 +141,8 @@ def test_too_few_points_are_refused() -> None:
         bd_rate(ANCHOR, short)
     with pytest.raises(IncomparableCurvesError, match="the anchor has 4 points, 5 are needed"):
         bd_quality(short, TEST)
-    beaten = RateQualityCurve(TEST.rates, (*TEST.qualities[:4], 30.0))
-    with pytest.raises(IncomparableCurvesError, match="4 points once 1 beaten by others are dropped"):
+    beaten = RateQualityCurve(TEST.rates, (*TEST.qualities[:2], *([30.0] * (len(TEST) - 2))))
+    with pytest.raises(IncomparableCurvesError, match="2 points once 3 beaten by others are dropped, 3 are needed"):
         bd_rate(ANCHOR, beaten)
 
 

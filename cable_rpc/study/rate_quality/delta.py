@@ -146,7 +146,7 @@ def bd_rate_between(
         bootstrap: how to draw sequences; None for no interval.
         interpolation: between the points of a curve.
         min_overlap: share of the spanned qualities that the curves must have in common, 0..1.
-        min_points: points that each curve needs after dominated ones are dropped, at least 2.
+        min_points: points that each curve needs, at least 2.
 
     Raises:
         ConfigurationError: an option is unusable, or scipy is missing.
@@ -171,7 +171,7 @@ def bd_quality_between(
         bootstrap: how to draw sequences; None for no interval.
         interpolation: between the points of a curve.
         min_overlap: share of the spanned log rates that the curves must have in common, 0..1.
-        min_points: points that each curve needs after dominated ones are dropped, at least 2.
+        min_points: points that each curve needs, at least 2.
 
     Raises:
         ConfigurationError: an option is unusable, or scipy is missing.
