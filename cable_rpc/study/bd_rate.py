@@ -118,7 +118,7 @@ def bd_rate(
         test: What to judge.
         method: Interpolation.
         min_overlap: Share of the spanned qualities that the curves must have in common, 0..1.
-        min_points: Points that each curve needs; `MIN_UNDOMINATED` of them must be left when dominated ones are dropped.
+        min_points: Points that each curve needs; `MIN_UNDOMINATED` of them must be left when beaten ones are dropped.
 
     Raises:
         IncomparableCurvesError: Too few points, or too small an overlap.
@@ -161,7 +161,7 @@ def bd_quality(
         test: What to judge.
         method: Interpolation.
         min_overlap: Share of the spanned log rates that the curves must have in common, 0..1.
-        min_points: Points that each curve needs; `MIN_UNDOMINATED` of them must be left when dominated ones are dropped.
+        min_points: Points that each curve needs; `MIN_UNDOMINATED` of them must be left when beaten ones are dropped.
 
     Raises:
         IncomparableCurvesError: Too few points, or too small an overlap.

@@ -19,6 +19,7 @@ from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.bd_rate import (
     MIN_OVERLAP,
     MIN_POINTS,
+    MIN_UNDOMINATED,
     BjontegaardDelta,
     IncomparableCurvesError,
     Interpolation,
@@ -27,8 +28,9 @@ from cable_rpc.study.bd_rate import (
     bd_rate,
 )
 from cable_rpc.study.metrics.bootstrap import Bootstrap, Interval
+from cable_rpc.study.rate_quality.drawn_curves import DrawnCurves
 from cable_rpc.study.rate_quality.points import Method
-from cable_rpc.study.rate_quality.pooling import grid_of
+from cable_rpc.study.rate_quality.pooling import Float64Array, grid_of
 from cable_rpc.study.rate_quality.refusals import how_to_compare, no_sequence_in_common, no_setting
 from cable_rpc.study.rate_quality.resampling import Pair, Resampled, paired, resample
 
@@ -128,6 +130,26 @@ class DeltaRules:
         except IncomparableCurvesError:
             return math.nan
 
+    def values(self, drawn: tuple[DrawnCurves, ...]) -> Float64Array:
+        """The mean difference of (anchor, test) in every draw, float64 [D], NaN where there is none."""
+        if self.interpolation != "pchip":
+            return np.array([self.value(curves) for curves in zip(*(one.curves() for one in drawn), strict=True)])
+        at_equal_rate = self.delta is bd_quality
+        anchor, test = drawn
+        (anchor_low, anchor_high, anchor_left), (test_low, test_high, test_left) = (
+            one.ends(of_rates=at_equal_rate) for one in drawn
+        )
+        low, high = np.maximum(anchor_low, test_low), np.minimum(anchor_high, test_high)
+        with np.errstate(all="ignore"):
+            differences = (
+                test.areas(low, high, of_rates=at_equal_rate) - anchor.areas(low, high, of_rates=at_equal_rate)
+            ) / (high - low)
+            found = differences if at_equal_rate else 100.0 * (10.0**differences - 1.0)
+        measured = np.minimum(*(one.measured.sum(axis=1) for one in drawn))
+        left = np.minimum(anchor_left, test_left)
+        comparable = (high > low) & (measured >= self.min_points) & (left >= min(MIN_UNDOMINATED, self.min_points))
+        return np.where(comparable & np.isfinite(found), found, np.nan)
+
 
 def bd_rate_between(
     anchor: Method,
@@ -194,7 +216,7 @@ def delta_between(anchor: Method, test: Method, bootstrap: Bootstrap | None, rul
         resampled = Resampled()
     else:
         reason = ""
-        resampled = resample((pair.anchor, pair.test), rules.of_draw().value, bootstrap, len(pair.judged))
+        resampled = resample((pair.anchor, pair.test), rules.of_draw().values, bootstrap, len(pair.judged))
     return DeltaResult(
         value=None if found is None else found.value,
         interval=resampled.interval,

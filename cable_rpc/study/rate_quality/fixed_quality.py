@@ -15,8 +15,9 @@ import numpy as np
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.bd_rate import RateQualityCurve, logarithms
 from cable_rpc.study.metrics.bootstrap import Bootstrap, Interval
+from cable_rpc.study.rate_quality.drawn_curves import DrawnCurves
 from cable_rpc.study.rate_quality.points import Method
-from cable_rpc.study.rate_quality.pooling import RateQualityGrid, grid_of
+from cable_rpc.study.rate_quality.pooling import Float64Array, RateQualityGrid, grid_of
 from cable_rpc.study.rate_quality.refusals import no_sequence_in_common, no_setting
 from cable_rpc.study.rate_quality.resampling import Pair, Resampled, paired, resample
 
@@ -76,7 +77,7 @@ def rate_at(method: Method, quality: float, bootstrap: Bootstrap | None) -> Fixe
     resampled = Resampled()
     if not math.isnan(rate):
         judged = int(np.count_nonzero(grid.judged))
-        resampled = resample((grid,), lambda curves: rate_on_hull(curves[0], quality), bootstrap, judged)
+        resampled = resample((grid,), lambda drawn: 10.0 ** drawn[0].log_rates_at(quality), bootstrap, judged)
     return FixedQuality(
         quality=quality,
         rate_kbps=number_or_none(rate),
@@ -105,7 +106,7 @@ def saving_at(anchor: Method, test: Method, quality: float, bootstrap: Bootstrap
     resampled = Resampled()
     if not math.isnan(saving):
         resampled = resample(
-            (pair.anchor, pair.test), lambda drawn: saving_on_hulls(drawn, quality), bootstrap, len(pair.judged)
+            (pair.anchor, pair.test), lambda drawn: drawn_savings(drawn, quality), bootstrap, len(pair.judged)
         )
     anchor_kbps, test_kbps = (rate_on_hull(curve, quality) for curve in curves)
     return SavingAtQuality(
@@ -131,6 +132,12 @@ def saving_on_hulls(curves: tuple[RateQualityCurve, ...], quality: float) -> flo
     """The saving of the second curve against the first; NaN where either doesn't reach the quality."""
     anchor, test = (rate_on_hull(curve, quality) for curve in curves)
     return 1.0 - test / anchor
+
+
+def drawn_savings(drawn: tuple[DrawnCurves, ...], quality: float) -> Float64Array:
+    """`saving_on_hulls` in every draw, float64 [D]."""
+    anchor, test = drawn
+    return 1.0 - 10.0 ** (test.log_rates_at(quality) - anchor.log_rates_at(quality))
 
 
 def rate_on_hull(curve: RateQualityCurve, quality: float) -> float:

@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cable_rpc.study.bd_rate import RateQualityCurve
 from cable_rpc.study.metrics.bootstrap import MIN_CLUSTERS, Bootstrap, Interval, bootstrap_interval, cluster_draws
+from cable_rpc.study.rate_quality.drawn_curves import DrawnCurves
 from cable_rpc.study.rate_quality.points import Method
-from cable_rpc.study.rate_quality.pooling import RateQualityGrid, grid_of
+from cable_rpc.study.rate_quality.pooling import Float64Array, RateQualityGrid, grid_of
 
 MIN_DEFINED_DRAWS = 0.9
 """Share of the draws that must have the figure before there is an interval: percentiles of the rest would be too
 narrow, for the draws that lack it are rarely an arbitrary lot."""
 
-CurvesFigure = Callable[[tuple[RateQualityCurve, ...]], float]
-"""A figure of one or two curves, NaN where they have none."""
+DrawnFigure = Callable[[tuple[DrawnCurves, ...]], Float64Array]
+"""A figure of one or two curves in every draw, float64 [D], NaN where they have none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +71,13 @@ def paired(anchor: Method, test: Method) -> Pair:
 
 
 def resample(
-    grids: tuple[RateQualityGrid, ...], figure: CurvesFigure, bootstrap: Bootstrap | None, informative: int
+    grids: tuple[RateQualityGrid, ...], figure: DrawnFigure, bootstrap: Bootstrap | None, informative: int
 ) -> Resampled:
     """The spread of a figure over draws of whole sequences, the same draws for every grid.
 
     Args:
         grids: of the same sequences.
-        figure: from the pooled curve of each grid in one draw.
+        figure: from the pooled curves of each grid in all draws.
         bootstrap: how to draw; None draws nothing.
         informative: sequences that bear on the figure; fewer than three give no interval.
     """
@@ -90,8 +90,7 @@ def resample(
     clusters = len(grids[0].sequences)
     # Few sequences have few distinct draws: 10 for three, 462 for six.
     distinct, inverse = np.unique(cluster_draws(clusters, bootstrap), axis=0, return_inverse=True)
-    curves = zip(*(grid.curves(distinct) for grid in grids), strict=True)
-    sample = np.array([figure(drawn) for drawn in curves], np.float64)[inverse.reshape(-1)]
+    sample = figure(tuple(DrawnCurves.of(grid, distinct) for grid in grids))[inverse.reshape(-1)]
     defined = 1.0 - float(np.isnan(sample).mean())
     if defined < MIN_DEFINED_DRAWS:
         return Resampled(
