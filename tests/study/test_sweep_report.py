@@ -24,13 +24,15 @@ from cable_rpc.study.sweep.simulated_link import SimulatedLink
 from cable_rpc.study.sweep.store import CellStore
 from cable_rpc.study.sweep_report.examples import MOST_PICTURES, example_rows
 from cable_rpc.study.sweep_report.facts import byte_savings, facts_of
-from cable_rpc.study.sweep_report.methods import anchors_of, cells_by_method, method_styles
+from cable_rpc.study.sweep_report.methods import ShortNames, anchors_of, cells_by_method, method_styles, short_names
 
 pytest.importorskip("plotly")
 
 from cable_rpc.study.sweep_report import write_sweep_report
 
 CABLE, MOTION = "cable · black · h264", "motion-only · blur · h264"
+SHORT_CABLE, SHORT_MOTION, SHORT_ANCHOR = "cable · black", "motion-only · blur", "full-frame"
+"""As the report names them, since H.264 is what all have in common."""
 HOSTILE = '<img src="x" onerror="window.broken=1"></script>'
 
 
@@ -59,12 +61,13 @@ def test_table_holds_what_the_curves_were_made_of(reported: Path) -> None:
     mean_bytes = sum(40_000 * (1 + 0.5 * number) for number in range(len(SEQUENCES))) / len(SEQUENCES)
     at_95 = mean_bytes * 2 ** (-(26 - 22) / 6) * 10 * 8 / 1000
     assert KEPT[CRFS.index(26)] == 19, "the setting that keeps 95 %"
-    assert rows[ANCHOR][:2] == ["–", f"{at_95:.0f}"]
-    assert rows[CABLE] == [
-        ANCHOR, f"{0.6 * at_95:.0f}", "40.0 %", rows[CABLE][3], "40.0 %", "-40.0", rows[CABLE][6], "100", "0 (anchor 0)"
+    assert rows[SHORT_ANCHOR][:3] == ["–", "–", f"{at_95:.0f}"]
+    cable = rows[SHORT_CABLE]
+    assert cable == [
+        "-40.0", cable[1], f"{0.6 * at_95:.0f}", "40.0 %", cable[4], "40.0 %", "100", "0 (anchor 0)", SHORT_ANCHOR
     ]  # fmt: skip
-    assert rows[MOTION][2] == "10.0 %"
-    assert rows[MOTION][5] == "-10.0"
+    assert rows[SHORT_MOTION][3] == "10.0 %"
+    assert rows[SHORT_MOTION][0] == "-10.0"
 
 
 def test_head_says_what_was_swept_and_what_it_means(reported: Path) -> None:
@@ -80,7 +83,7 @@ def test_head_says_what_was_swept_and_what_it_means(reported: Path) -> None:
 def test_failed_cell_is_shown_and_escaped(reported: Path) -> None:
     page = markup(reported / "report.html")
     assert "synthetic:&lt;b&gt;drive&lt;/b&gt;: out of &amp; memory" in page
-    assert "synthetic:drive-a, cable · black · h264, q 50" in page
+    assert "synthetic:drive-a, cable · black, q 50" in page
     assert "axes: &amp;all [1, 2]" in page
 
 
@@ -103,7 +106,7 @@ def test_exports_are_whole_and_sized_for_papers(reported: Path) -> None:
 
 def test_curves_file_holds_every_point(reported: Path) -> None:
     with (reported / "export" / "curves.csv").open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if row["quality"] == "retention" and row["method"] == CABLE]
+        rows = [row for row in csv.DictReader(file) if row["quality"] == "retention" and row["method"] == SHORT_CABLE]
     single = {(row["sequence"], row["setting"]): row for row in rows}
     assert len(rows) == len(single) == len(CRFS) * (1 + len(SEQUENCES))
     row = single["drive-b", "q 34"]
@@ -126,7 +129,7 @@ def test_two_curves_that_cannot_be_compared_say_why(tmp_path: Path) -> None:
     run = sweep_run(tmp_path)
     few = tuple(cell for cell in run.cells if cell.cell.strategy != "cable" or cell.cell.rate.quality in (22, 26))
     page = markup(write_sweep_report(replace(run, cells=few, qualities=("retention",)), export=False))
-    assert rows_of(page, "retention")[CABLE][5] == "–"
+    assert rows_of(page, "retention")[SHORT_CABLE][0] == "–"
     assert re.search(r"BD-rate: .*more CRFs", page)
 
 
@@ -213,12 +216,21 @@ def stored(run: SweepRun) -> Path:
     return run.folder
 
 
+def test_names_leave_out_what_all_methods_share():
+    whole = "full-frame · h264 · 10 fps"
+    frozen, thin = (f"cable · frozen · {codec} · 10 fps" for codec in ("h264", "vp9"))
+    assert short_names((whole, frozen)) == ShortNames({whole: "full-frame", frozen: "cable · frozen"}, "h264 · 10 fps")
+    assert short_names((frozen, thin)).of == {frozen: "cable · h264", thin: "cable · vp9"}
+    assert short_names((whole,)) == ShortNames({whole: whole}, "")
+    assert short_names(("cable · a · b", "cable · b · a")).common == "", "two methods never get one name"
+
+
 def test_command_reports_a_stored_sweep(tmp_path: Path) -> None:
     folder = stored(replace(sweep_run(tmp_path), qualities=("retention",)))
     ran = CliRunner().invoke(app, ["report", str(folder), "--draws", "0", "--no-export"])
     assert ran.exit_code == 0, ran.output
     assert "report.html" in ran.output
-    assert rows_of(markup(folder / "report.html"), "retention")[CABLE][5] == "-40.0"
+    assert rows_of(markup(folder / "report.html"), "retention")[SHORT_CABLE][0] == "-40.0"
 
 
 def test_command_makes_a_stream_report_again_and_refuses_other_folders(tmp_path: Path) -> None:

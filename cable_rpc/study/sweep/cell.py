@@ -74,10 +74,14 @@ class SweepCell:
     roi_label: str = "robust"
     """The ROI settings' name, for people."""
     block_size: int = 8
+    name: str = ""
+    """For people, in place of what `method` is otherwise put together from."""
 
     @property
     def method(self) -> str:
         """Everything but the sequence and the rate point, for people: cells of equal method lie on one curve."""
+        if self.name:
+            return self.name
         kind, separator, detector = self.strategy.partition(":")
         parts = [f"{kind}{separator}{PurePath(detector).stem}"]
         if self.strategy != ANCHOR_STRATEGY:
@@ -103,7 +107,7 @@ class SweepCell:
     def settings(self) -> dict[str, Any]:
         """All that determines the cell, but for code and weights, as plain JSON values; labels are left out."""
         content = asdict(self)
-        del content["treatment_label"], content["roi_label"]
+        del content["treatment_label"], content["roi_label"], content["name"]
         if self.link is not None:
             del content["link"]["name"]
         return content

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from cable_rpc.errors import ConfigurationError
@@ -10,7 +11,7 @@ from cable_rpc.study.report_page import study_extra_missing
 from cable_rpc.study.run_record import REPORT_FILE, write_text
 from cable_rpc.study.sweep.qualities import find_quality
 from cable_rpc.study.sweep.run_folder import SweepRun
-from cable_rpc.study.sweep_report.methods import anchors_of, cells_by_method, method_styles
+from cable_rpc.study.sweep_report.methods import anchors_of, cells_by_method, method_styles, renamed, short_names
 
 EXPORT_FOLDER = "export"
 
@@ -57,8 +58,13 @@ def write_sweep_report(
     for name in names:
         find_quality(name)
     compared = anchors_of(methods, anchor or run.anchor, for_all=anchor is not None)
+    short = short_names(tuple(methods))
+    run = replace(run, cells=renamed(run.cells, short.of))
+    methods = cells_by_method(run.cells)
+    compared = {short.of[label]: short.of[other] if other else None for label, other in compared.items()}
     anchors = tuple(dict.fromkeys(label for label in compared.values() if label))
-    content = gather(run, methods, compared, method_styles(tuple(methods), anchors), names, bootstrap)
+    styles = method_styles(tuple(methods), anchors)
+    content = gather(run, methods, compared, styles, names, bootstrap, common=short.common)
     path = run.folder / REPORT_FILE
     try:
         write_text(path, page_text(content))

@@ -30,6 +30,8 @@ class ReportContent:
     """The main quality first."""
     level: float
     """Retention in percent at which bytes are looked at."""
+    common: str = ""
+    """What all methods have in common, and their labels leave out."""
 
     @property
     def main(self) -> QualityResult:
@@ -54,6 +56,8 @@ def gather(
     styles: Mapping[str, MethodStyle],
     qualities: Sequence[str],
     bootstrap: Bootstrap | None,
+    *,
+    common: str = "",
 ) -> ReportContent:
     """Compare methods by each quality that was measured.
 
@@ -64,6 +68,7 @@ def gather(
         styles: of every method.
         qualities: names, the main one first.
         bootstrap: how to draw sequences; None for no intervals.
+        common: what all methods have in common, and their labels leave out.
 
     Raises:
         ConfigurationError: none of the qualities was measured.
@@ -76,4 +81,4 @@ def gather(
             f"none of {', '.join(qualities)} could be measured on these sequences; choose another with --quality"
         )
     anchors = tuple(dict.fromkeys(label for label in compared.values() if label))
-    return ReportContent(run, methods, anchors, styles, results, levels[0] if levels else USUAL_LEVEL)
+    return ReportContent(run, methods, anchors, styles, results, levels[0] if levels else USUAL_LEVEL, common)

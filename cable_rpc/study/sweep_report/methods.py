@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.report_plots import GREY
@@ -24,6 +24,8 @@ SHAPES = (
 )
 """A marker by its names in Plotly and Matplotlib, and as a character. Their numbers have no common divisor, so that 63
 methods differ."""
+PART = " · "
+"""Between the parts of a method's label."""
 ANCHOR_SHAPE = ("circle", "o", "●")
 
 
@@ -51,6 +53,37 @@ def method_styles(labels: Sequence[str], anchors: Sequence[str]) -> dict[str, Me
             place = others.index(label)
             styles[label] = MethodStyle(label, COLOURS[place % len(COLOURS)], *SHAPES[place % len(SHAPES)])
     return styles
+
+
+@dataclass(frozen=True, slots=True)
+class ShortNames:
+    """Methods named by what tells them from each other."""
+
+    of: Mapping[str, str]
+    """Whole label to short name."""
+    common: str
+    """What all of them have in common, left out of the names."""
+
+
+def short_names(labels: Sequence[str]) -> ShortNames:
+    """Names without the parts that all labels share; the first part, the strategy, always stays."""
+    parts = {label: label.split(PART) for label in labels}
+    shared = set.intersection(*(set(own[1:]) for own in parts.values())) if len(parts) > 1 else set()
+    names = {
+        label: PART.join(part for k, part in enumerate(own) if not k or part not in shared)
+        for label, own in parts.items()
+    }
+    if len(set(names.values())) < len(names):
+        return ShortNames({label: label for label in labels}, "")
+    first = next(iter(parts.values()))
+    return ShortNames(names, PART.join(part for part in first[1:] if part in shared))
+
+
+def renamed(cells: Sequence[MeasuredCell], names: Mapping[str, str]) -> tuple[MeasuredCell, ...]:
+    """The cells under their methods' short names."""
+    return tuple(
+        replace(one, cell=replace(one.cell, name=names.get(one.cell.method, one.cell.method))) for one in cells
+    )
 
 
 def cells_by_method(cells: Sequence[MeasuredCell]) -> dict[str, tuple[MeasuredCell, ...]]:

@@ -98,6 +98,7 @@ def lead_text(content: ReportContent) -> str:
         f"{len(content.methods)} methods",
         f"{sum(facts_of([cell]).frames for cell in measured):,} frames".replace(",", "\u00a0"),
     ]
+    parts += [f"all {content.common}"] if content.common else []
     parts += [f"{len(content.failed)} failed"] if content.failed else []
     parts += [f"{content.run.missing} not measured yet"] if content.run.missing else []
     when = content.run.finished or content.run.started

@@ -34,23 +34,24 @@ class PageTable:
 
 def methods_table(result: QualityResult) -> PageTable:
     """Rates at fixed quality, BD-rate and BD-quality of every method."""
-    heading = ["method", "compared with"]
+    unit = f", {result.quality.unit}" if result.quality.unit else ""
+    heading = ["method", "BD-rate, %", f"BD-quality{unit}"]
     levels = result.methods[0].levels if result.methods else ()
     for one in levels:
         heading += [f"kbit/s at {one.level:g}\u00a0%", f"saved at {one.level:g}\u00a0%"]
-    unit = f", {result.quality.unit}" if result.quality.unit else ""
-    heading += ["BD-rate, %", f"BD-quality{unit}", "overlap, %", "beaten points"]
+    heading += ["overlap, %", "beaten points", "compared with"]
     return PageTable(tuple(heading), tuple(method_row(one) for one in result.methods))
 
 
 def method_row(one: MethodResult) -> tuple[Cell, ...]:
     """One method."""
-    cells = [Cell(one.label), Cell(one.anchor or NOT_MEASURED)]
+    cells = [Cell(one.label), delta_cell(one.bd_rate), delta_cell(one.bd_quality, decimals=2)]
     for level in one.levels:
         cells += [rate_cell(level.rate), saving_cell(level.saving)]
-    cells += [delta_cell(one.bd_rate), delta_cell(one.bd_quality, decimals=2), overlap_cell(one.bd_rate)]
+    cells.append(overlap_cell(one.bd_rate))
     beaten = "" if one.bd_rate is None else f"{one.bd_rate.dropped_test} (anchor {one.bd_rate.dropped_anchor})"
     cells.append(Cell(beaten or NOT_MEASURED, None if one.bd_rate is None else one.bd_rate.dropped_test))
+    cells.append(Cell(one.anchor or NOT_MEASURED))
     return tuple(cells)
 
 
