@@ -24,7 +24,15 @@ from cable_rpc.study.sweep.simulated_link import SimulatedLink
 from cable_rpc.study.sweep.store import CellStore
 from cable_rpc.study.sweep_report.examples import MOST_PICTURES, example_rows
 from cable_rpc.study.sweep_report.facts import byte_savings, facts_of
-from cable_rpc.study.sweep_report.methods import ShortNames, anchors_of, cells_by_method, method_styles, short_names
+from cable_rpc.study.sweep_report.methods import (
+    ShortNames,
+    anchors_of,
+    at_any_scale,
+    cells_by_method,
+    is_repeated,
+    method_styles,
+    short_names,
+)
 
 pytest.importorskip("plotly")
 
@@ -242,3 +250,22 @@ def test_command_makes_a_stream_report_again_and_refuses_other_folders(tmp_path:
     write_summary(tmp_path, summarise(records, info))
     report(tmp_path)
     assert "clip" in markup(tmp_path / "report.html")
+
+
+def test_a_method_at_several_scales_is_also_one_that_takes_the_better(tmp_path: Path) -> None:
+    names = SEQUENCES
+    whole = method_cells("full-frame", "whole", 1.0, 1.0, names)
+    full, half = method_cells("cable", "black", 0.6, 0.3, names), method_cells("cable", "black", 0.3, 0.3, names)
+    halved = tuple(
+        replace(one, cell=replace(one.cell, treatment=replace(one.cell.treatment, scale=0.5))) for one in half
+    )
+    repeated = at_any_scale((*whole, *full, *halved))
+    assert {one.cell.method for one in repeated} == {f"{CABLE} · any scale"}
+    assert len(repeated) == len(full) + len(halved)
+    assert all(is_repeated(one.cell) for one in repeated)
+    assert len({(one.cell.clip, one.cell.setting) for one in repeated}) == len(repeated), "no setting twice"
+    run = replace(sweep_run(tmp_path), cells=(*whole, *full, *halved), qualities=("retention",))
+    page = markup(write_sweep_report(run, export=False))
+    rows = rows_of(page, "retention")
+    assert rows["cable · black · any scale"][0] == rows["cable · black · scale 0.5"][0], "the cheaper of the two"
+    assert f"{len(run.cells)} cells" in page

@@ -100,6 +100,11 @@ class SweepCell:
         return " · ".join(parts)
 
     @property
+    def setting(self) -> str:
+        """What was turned along the method's curve, for people; equal settings pool over sequences."""
+        return self.rate.label if self.treatment.scale == 1.0 else f"{self.rate.label}, scale {self.treatment.scale:g}"
+
+    @property
     def title(self) -> str:
         """For people: sequence, method and rate point."""
         return f"{self.clip.source}, {self.method}, {self.rate.label}"

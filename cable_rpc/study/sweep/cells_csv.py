@@ -44,7 +44,7 @@ def axes(cell: SweepCell) -> dict[str, Any]:
         "link": "" if cell.link is None else cell.link.name,
         "roi": cell.roi_label,
         "method": cell.method,
-        "setting": cell.rate.label,
+        "setting": cell.setting,
     }
 
 

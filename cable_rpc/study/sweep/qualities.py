@@ -185,7 +185,7 @@ def point_of(measured: MeasuredCell, result: CellResult, quality: Quality, seque
     gained, possible = quality.parts(result) or (0.0, 0.0)
     return SequencePoint(
         sequence,
-        measured.cell.rate.label,
+        measured.cell.setting,
         result.uplink.total,
         result.seconds,
         quality.scale * gained,

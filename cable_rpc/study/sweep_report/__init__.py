@@ -11,7 +11,14 @@ from cable_rpc.study.report_page import study_extra_missing
 from cable_rpc.study.run_record import REPORT_FILE, write_text
 from cable_rpc.study.sweep.qualities import find_quality
 from cable_rpc.study.sweep.run_folder import SweepRun
-from cable_rpc.study.sweep_report.methods import anchors_of, cells_by_method, method_styles, renamed, short_names
+from cable_rpc.study.sweep_report.methods import (
+    anchors_of,
+    at_any_scale,
+    cells_by_method,
+    method_styles,
+    renamed,
+    short_names,
+)
 
 EXPORT_FOLDER = "export"
 
@@ -47,6 +54,7 @@ def write_sweep_report(
         from cable_rpc.study.sweep_report.page import page_text
     except ImportError as error:
         raise study_extra_missing(error) from error
+    run = replace(run, cells=(*run.cells, *at_any_scale(run.cells)))
     methods = cells_by_method(run.cells)
     if not methods:
         failed = f"; the first says: {run.cells[0].error}" if run.cells else ""

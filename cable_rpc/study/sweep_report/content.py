@@ -10,7 +10,7 @@ from cable_rpc.study.metrics import Bootstrap
 from cable_rpc.study.sweep.cell import MeasuredCell
 from cable_rpc.study.sweep.run_folder import SweepRun
 from cable_rpc.study.sweep_report.comparison import QualityResult, quality_result
-from cable_rpc.study.sweep_report.methods import MethodStyle
+from cable_rpc.study.sweep_report.methods import MethodStyle, is_repeated
 
 USUAL_LEVEL = 95.0
 """Retention in percent at which bytes are looked at where the run names no level."""
@@ -40,13 +40,13 @@ class ReportContent:
 
     @property
     def measured(self) -> list[MeasuredCell]:
-        """All measured cells."""
-        return [cell for cells in self.methods.values() for cell in cells]
+        """All measured cells, each once."""
+        return [cell for cells in self.methods.values() for cell in cells if not is_repeated(cell.cell)]
 
     @property
     def failed(self) -> list[MeasuredCell]:
         """Cells without a result."""
-        return [cell for cell in self.run.cells if cell.result is None]
+        return [cell for cell in self.run.cells if cell.result is None and not is_repeated(cell.cell)]
 
 
 def gather(

@@ -10,6 +10,7 @@ from cable_rpc.study.report_page import jpeg_uri
 from cable_rpc.study.sweep.cell import CellResult, MeasuredCell
 from cable_rpc.study.sweep.qualities import QUALITIES
 from cable_rpc.study.sweep_report.facts import facts_of
+from cable_rpc.study.sweep_report.methods import is_repeated
 
 NEARLY_EQUAL = 0.15
 """Rates that differ by no more are called equal."""
@@ -54,7 +55,10 @@ def example_rows(methods: Mapping[str, Sequence[MeasuredCell]], anchors: Sequenc
         anchors: labels of the anchors, of which the first that has the sequence sets its bit rate.
     """
     pictured = [
-        (cell, cell.result) for cells in methods.values() for cell in cells if cell.example and cell.result is not None
+        (cell, cell.result)
+        for cells in methods.values()
+        for cell in cells
+        if cell.example and cell.result is not None and not is_repeated(cell.cell)
     ]
     sequences = tuple(dict.fromkeys(result.sequence for _, result in pictured))
     rows: list[ExampleRow] = []
@@ -98,7 +102,7 @@ def example_of(measured: MeasuredCell, rate_kbps: float) -> Example:
     own = facts_of([measured]).rate_kbps
     near = distance(measured, rate_kbps) <= math.log(1 + NEARLY_EQUAL)
     off = "" if near or rate_kbps <= 0 else f"{100 * (own / rate_kbps - 1):+.0f} % bit rate"
-    parts = [measured.cell.rate.label, f"{own:.0f} kbit/s"]
+    parts = [measured.cell.setting, f"{own:.0f} kbit/s"]
     parts += [] if measured.result is None else kept_text(measured.result)
     uri = ""
     if measured.example is not None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from cable_rpc.study.metrics import percentiles
 from cable_rpc.study.sweep.cell import ANCHOR_STRATEGY, MeasuredCell, SweepCell, UplinkBytes
+from cable_rpc.study.sweep_report.methods import is_repeated
 
 KEY_LETTERS = 10
 """Of a cell's key, enough to find it."""
@@ -63,7 +64,7 @@ def settings_facts(cells: Sequence[MeasuredCell]) -> dict[str, CellFacts]:
     """Facts of a method by setting, in the order of the cells, over all its sequences."""
     grouped: dict[str, list[MeasuredCell]] = {}
     for measured in cells:
-        grouped.setdefault(measured.cell.rate.label, []).append(measured)
+        grouped.setdefault(measured.cell.setting, []).append(measured)
     return {setting: facts_of(members) for setting, members in grouped.items()}
 
 
@@ -82,6 +83,8 @@ def byte_savings(methods: Mapping[str, Sequence[MeasuredCell]]) -> list[tuple[Me
     savings = []
     for measured in cells:
         total = whole.get(like_key(measured.cell))
+        if is_repeated(measured.cell):
+            continue
         if measured.cell.strategy != ANCHOR_STRATEGY and measured.cell.rate.bitrate_kbps is None and total:
             savings.append((measured, 1.0 - facts_of([measured]).uplink.total / total))
     return savings

@@ -26,6 +26,7 @@ SHAPES = (
 methods differ."""
 PART = " · "
 """Between the parts of a method's label."""
+ANY_SCALE = "any scale"
 ANCHOR_SHAPE = ("circle", "o", "●")
 
 
@@ -53,6 +54,29 @@ def method_styles(labels: Sequence[str], anchors: Sequence[str]) -> dict[str, Me
             place = others.index(label)
             styles[label] = MethodStyle(label, COLOURS[place % len(COLOURS)], *SHAPES[place % len(SHAPES)])
     return styles
+
+
+def at_any_scale(cells: Sequence[MeasuredCell]) -> tuple[MeasuredCell, ...]:
+    """For each method that was measured at several upload scales, its cells once more as one method.
+
+    Its hull takes the better scale at each rate, as a sender does that adapts its resolution ("convex hull" encoding,
+    De Cock et al., ICIP 2016).
+    """
+    families: dict[str, list[MeasuredCell]] = {}
+    for measured in cells:
+        scale = f"{PART}scale {measured.cell.treatment.scale:g}"
+        families.setdefault(measured.cell.method.replace(scale, "", 1), []).append(measured)
+    return tuple(
+        replace(one, cell=replace(one.cell, name=f"{label}{PART}{ANY_SCALE}"))
+        for label, members in families.items()
+        if len({one.cell.treatment.scale for one in members if one.result is not None}) > 1
+        for one in members
+    )
+
+
+def is_repeated(cell: SweepCell) -> bool:
+    """Whether it is one of `at_any_scale`, which also stands under its own method."""
+    return cell.name.endswith(f"{PART}{ANY_SCALE}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -238,7 +238,7 @@ def bytes_figures(results: Sequence[QualityResult], methods: Cells, level: float
     levelled = [result for result in results if result.quality.name == LEVELLED_QUALITY]
     if levelled:
         figures[f"at {level:g} % of detections kept"] = bytes_figure(byte_bars(levelled[0], methods, level))
-    settings = dict.fromkeys(cell.cell.rate.label for cells in methods.values() for cell in cells)
+    settings = dict.fromkeys(cell.cell.setting for cells in methods.values() for cell in cells)
     return figures | {setting: bytes_figure(setting_bars(setting, methods)) for setting in settings}
 
 
@@ -248,7 +248,7 @@ def pixels_figure(methods: Cells, styles: Styles) -> go.Figure | None:
     for measured, saving in byte_savings(methods):
         facts = facts_of([measured])
         if facts.pixel_saving is not None and measured.result is not None:
-            where = f"{escape(measured.result.sequence)}, {escape(measured.cell.rate.label)}"
+            where = f"{escape(measured.result.sequence)}, {escape(measured.cell.setting)}"
             points.setdefault(measured.cell.method, []).append((100 * facts.pixel_saving, 100 * saving, where))
     if not points:
         return None
