@@ -258,6 +258,13 @@ def test_a_sweep_without_a_name_is_called_as_its_file(tmp_path: Path) -> None:
         read_config(tmp_path / "none.yaml")
 
 
+@pytest.mark.parametrize("name", ["real-clips", "rendered-drives", "codecs", "feedback-delay"])
+def test_the_configurations_of_the_study_are_valid(name: str) -> None:
+    config = read_config(EXAMPLES.parent / "study" / f"{name}.yaml")
+    assert config.name == name
+    assert any(cell.method.startswith(config.anchor) for cell in config.cells)
+
+
 @pytest.mark.parametrize(("name", "cells"), [("rendered", 3 * 3 * 5), ("links", 3 * (5 + 2 * 5 * 2 + 2 * 3 * 2))])
 def test_the_documented_examples_are_valid(name: str, cells: int) -> None:
     found = read_config(EXAMPLES / f"{name}.yaml")
