@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,10 @@ def report(
         str | None,
         typer.Option(help="Method that all others are compared with, named as in the report.", metavar="METHOD"),
     ] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(help="Show these methods alone, named as in the report; repeatable.", metavar="METHOD"),
+    ] = None,
     draws: Annotated[int, typer.Option(help="Bootstrap draws for the intervals; 0 for none.", min=0)] = 2000,
     export: Annotated[
         bool, typer.Option("--export/--no-export", help="PNG, PDF, LaTeX, Markdown and CSV in RUN/export.")
@@ -40,7 +45,7 @@ def report(
     Example: [bold]cable-rpc report out/sweep/night[/bold]
     """
     if (run / SWEEP_FILE).is_file():
-        print(f"wrote {sweep_report(run, quality, anchor, draws, export=export, store=store)}")
+        print(f"wrote {sweep_report(run, quality, anchor, method or (), draws, export=export, store=store)}")
     elif (run / FRAMES_FILE).is_file() and (run / SUMMARY_FILE).is_file():
         from cable_rpc.study.report import write_report
 
@@ -53,7 +58,14 @@ def report(
 
 
 def sweep_report(
-    folder: Path, quality: str | None, anchor: str | None, draws: int, *, export: bool, store: Path | None
+    folder: Path,
+    quality: str | None,
+    anchor: str | None,
+    methods: Sequence[str],
+    draws: int,
+    *,
+    export: bool,
+    store: Path | None,
 ) -> Path:
     """Report a sweep.
 
@@ -67,7 +79,9 @@ def sweep_report(
     bootstrap = Bootstrap(draws) if draws else None
     sweep = read_run(folder, store)
     with Console(stderr=True).status(f"comparing methods over {draws} draws of sequences"):
-        path = write_sweep_report(sweep, quality=quality, anchor=anchor, bootstrap=bootstrap, export=export)
+        path = write_sweep_report(
+            sweep, quality=quality, anchor=anchor, only=methods, bootstrap=bootstrap, export=export
+        )
     if export:
         print(f"wrote {folder / EXPORT_FOLDER}")
     return path

@@ -269,3 +269,13 @@ def test_a_method_at_several_scales_is_also_one_that_takes_the_better(tmp_path: 
     rows = rows_of(page, "retention")
     assert rows["cable · black · any scale"][0] == rows["cable · black · scale 0.5"][0], "the cheaper of the two"
     assert f"{len(run.cells)} cells" in page
+
+
+def test_chosen_methods_stand_beside_their_anchor_alone(tmp_path: Path) -> None:
+    run = replace(sweep_run(tmp_path), qualities=("retention",))
+    rows = rows_of(markup(write_sweep_report(run, only=(SHORT_CABLE,), export=False)), "retention")
+    assert set(rows) == {SHORT_ANCHOR, SHORT_CABLE}
+    rows = rows_of(markup(write_sweep_report(run, anchor=SHORT_MOTION, export=False)), "retention")
+    assert rows[SHORT_CABLE][-1] == SHORT_MOTION
+    with pytest.raises(ConfigurationError, match="no method of this run is called 'x'; choose of: "):
+        write_sweep_report(run, only=("x",), export=False)

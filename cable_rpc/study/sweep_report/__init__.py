@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.metrics import Bootstrap
 from cable_rpc.study.report_page import study_extra_missing
 from cable_rpc.study.run_record import REPORT_FILE, write_text
+from cable_rpc.study.sweep.cell import MeasuredCell
 from cable_rpc.study.sweep.qualities import find_quality
 from cable_rpc.study.sweep.run_folder import SweepRun
 from cable_rpc.study.sweep_report.methods import (
@@ -18,6 +20,7 @@ from cable_rpc.study.sweep_report.methods import (
     method_styles,
     renamed,
     short_names,
+    whole_label,
 )
 
 EXPORT_FOLDER = "export"
@@ -28,6 +31,7 @@ def write_sweep_report(
     *,
     quality: str | None = None,
     anchor: str | None = None,
+    only: Sequence[str] = (),
     bootstrap: Bootstrap | None = None,
     export: bool = True,
 ) -> Path:
@@ -36,8 +40,9 @@ def write_sweep_report(
     Args:
         run: measured cells and what they were measured with.
         quality: that the report opens with; the configuration's first by default. The configuration's others follow.
-        anchor: whole label of the method that all others are compared with; by default the configuration's anchor, at
-            the frame rate of each method.
+        anchor: the method that all others are compared with, by its name in the report or its whole label; by default
+            the configuration's anchor, at the frame rate of each method.
+        only: names or whole labels of the methods to show, beside their anchors; none shows all.
         bootstrap: how intervals are drawn; None for none.
         export: whether ``export/`` is written.
 
@@ -65,9 +70,10 @@ def write_sweep_report(
     names = tuple(dict.fromkeys([quality] if quality else []) | dict.fromkeys(run.qualities))
     for name in names:
         find_quality(name)
-    compared = anchors_of(methods, anchor or run.anchor, for_all=anchor is not None)
-    short = short_names(tuple(methods))
-    run = replace(run, cells=renamed(run.cells, short.of))
+    whole = whole_label(anchor, tuple(methods)) if anchor else run.anchor
+    compared = shown(anchors_of(methods, whole, for_all=anchor is not None), only)
+    short = short_names(tuple(compared))
+    run = replace(run, cells=renamed([cell for cell in run.cells if is_shown(cell, compared)], short.of))
     methods = cells_by_method(run.cells)
     compared = {short.of[label]: short.of[other] if other else None for label, other in compared.items()}
     anchors = tuple(dict.fromkeys(label for label in compared.values() if label))
@@ -81,3 +87,21 @@ def write_sweep_report(
     except OSError as error:
         raise ConfigurationError(f"can't write the report into {run.folder}: {error.strerror or error}") from error
     return path
+
+
+def shown(compared: Mapping[str, str | None], only: Sequence[str]) -> dict[str, str | None]:
+    """The methods to show with what each is compared with; anchors are always among them.
+
+    Raises:
+        ConfigurationError: there is no method of a name.
+    """
+    if not only:
+        return dict(compared)
+    chosen = {whole_label(name, tuple(compared)) for name in only}
+    chosen |= {other for label, other in compared.items() if label in chosen and other}
+    return {label: other for label, other in compared.items() if label in chosen}
+
+
+def is_shown(measured: MeasuredCell, compared: Mapping[str, str | None]) -> bool:
+    """Whether a cell belongs to a method that is shown, or failed."""
+    return measured.cell.method in compared or measured.result is None

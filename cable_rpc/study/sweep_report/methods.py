@@ -103,6 +103,18 @@ def short_names(labels: Sequence[str]) -> ShortNames:
     return ShortNames(names, PART.join(part for part in first[1:] if part in shared))
 
 
+def whole_label(name: str, labels: Sequence[str]) -> str:
+    """The label that a name stands for, itself or shortened.
+
+    Raises:
+        ConfigurationError: it stands for none.
+    """
+    found = {short: label for label, short in short_names(labels).of.items()} | {label: label for label in labels}
+    if name not in found:
+        raise ConfigurationError(f"no method of this run is called '{name}'; choose of: {'; '.join(found)}")
+    return found[name]
+
+
 def renamed(cells: Sequence[MeasuredCell], names: Mapping[str, str]) -> tuple[MeasuredCell, ...]:
     """The cells under their methods' short names."""
     return tuple(
