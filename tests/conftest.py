@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Time is measured in benchmarks; on a busy machine a deadline fails tests that are right.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 # Models, codecs and OpenCV each start a thread pool; two test cores are served best by one thread for each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
