@@ -45,3 +45,25 @@ class RemoteError(CableError):
     """The other end refused, vanished or closed the session."""
 
     code = grpc.StatusCode.UNAVAILABLE
+
+
+class AuthenticationError(CableError):
+    """The peer did not prove who it is, or is not known here."""
+
+    code = grpc.StatusCode.UNAUTHENTICATED
+
+
+class Refusal(CableError):
+    """What was asked for is fine, but not now; carries when to try again."""
+
+    code = grpc.StatusCode.UNAVAILABLE
+
+    def __init__(self, message: str, retry_after_s: float) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+
+
+class CapacityError(Refusal):
+    """A limit of the server or of the peer's share is used up."""
+
+    code = grpc.StatusCode.RESOURCE_EXHAUSTED

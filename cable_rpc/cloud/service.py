@@ -9,7 +9,9 @@ import signal
 import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import aclosing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -17,15 +19,23 @@ from cable_codecs import available_codecs
 from google.rpc import code_pb2, status_pb2
 
 import cable_rpc
+from cable_rpc.cloud.admission import AdmissionControl
+from cable_rpc.cloud.authentication import AuthenticationInterceptor, Authenticator, current_identity
+from cable_rpc.cloud.limits import ServerLimits
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.session import PerceptionSession, SessionLimits, model_infos
-from cable_rpc.errors import ConfigurationError
+from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
+from cable_rpc.cloud.tokens import AccessFile
+from cable_rpc.errors import ConfigurationError, Refusal
 from cable_rpc.wire.channel import MAX_MESSAGE_BYTES, server_options
-from cable_rpc.wire.convert import CODEC_NAMES, PROTOCOL_REVISION
+from cable_rpc.wire.convert import CODEC_NAMES, PROTOCOL_REVISION, status_of
 from cable_rpc.wire.v1 import perception_pb2 as pb
 from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
 log = logging.getLogger(__name__)
+
+SPARE_RPCS = 16
+"""Calls beside the streams: clocks, questions about the server, and streams that are told in band that it is full."""
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
@@ -40,6 +50,18 @@ class ServerConfig:
     max_message_bytes: int = MAX_MESSAGE_BYTES
     decode_threads: int = max(1, (os.cpu_count() or 2) // 2)
     drain_s: float = 5.0
+    shares: ServerLimits = field(default_factory=ServerLimits)
+    """What all clients together, and each of them, may use."""
+    tls: TlsFiles | None = None
+    """None = plain text."""
+    tokens: Path | None = None
+    """File of who may come (`cable_rpc.cloud.tokens`); None = everybody who can connect."""
+    write_timeout_s: float = 20.0
+    """A client that takes none of its answers for so long is cut off."""
+    access_check_s: float = 1.0
+    """How often the token file is looked at."""
+    alternative_target: str = ""
+    """Where clients are sent when this server stops; empty = they come back here."""
 
 
 class PerceptionService(pb_grpc.PerceptionServiceServicer):
@@ -49,20 +71,32 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
         self._models = models
         self._config = config
         self._decode_executor = ThreadPoolExecutor(config.decode_threads, thread_name_prefix="decode")
+        self._admission = AdmissionControl(config.shares)
         self._sessions: set[PerceptionSession] = set()
         self._idle = asyncio.Event()
         self._idle.set()
 
     async def StreamPerception(  # noqa: N802 - the wire name
         self, request_iterator: AsyncIterator[pb.StreamPerceptionRequest], context: Context
-    ) -> AsyncIterator[pb.StreamPerceptionResponse]:
+    ) -> None:
         """One camera's session."""
-        session = PerceptionSession(self._models, self._config.limits, self._decode_executor)
+        session = PerceptionSession(
+            self._models,
+            self._config.limits,
+            self._decode_executor,
+            admission=self._admission,
+            identity=current_identity.get(),
+        )
         self._sessions.add(session)
         self._idle.clear()
         try:
-            async for response in session.run(request_iterator):
-                yield response
+            async with aclosing(session.run(request_iterator)) as responses:
+                async for response in responses:
+                    async with asyncio.timeout(self._config.write_timeout_s):
+                        await context.write(response)
+        except TimeoutError:
+            log.warning("session %s: the client takes no answers", session.session_id)
+            await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "answers were not taken in time")
         finally:
             self._sessions.discard(session)
             if not self._sessions:
@@ -92,11 +126,24 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
             server_send_time_ns=time.monotonic_ns(),
         )
 
-    async def drain(self) -> None:
-        """Sends every client away and waits, bounded, until they have gone."""
-        status = status_pb2.Status(code=code_pb2.UNAVAILABLE, message="the server is shutting down")
+    def send_away_unknown(self, authenticator: Authenticator) -> None:
+        """Ends the sessions of those who may no longer come."""
         for session in list(self._sessions):
-            session.drain(status, pb.CLOSE_ACTION_RESUME)
+            if not authenticator.still_known(session.identity):
+                log.warning("session %s: %s has been taken off the list", session.session_id, session.identity.name)
+                status = status_pb2.Status(
+                    code=code_pb2.UNAUTHENTICATED, message="the token is not known here any more"
+                )
+                session.drain(status, pb.CLOSE_ACTION_STOP)
+
+    async def drain(self) -> None:
+        """Sends every client away, lets no new one in, and waits, bounded, until they have gone."""
+        going = Refusal("the server is shutting down", self._config.drain_s)
+        self._admission.close(going)
+        elsewhere = self._config.alternative_target
+        action = pb.CLOSE_ACTION_MOVE if elsewhere else pb.CLOSE_ACTION_RESUME
+        for session in list(self._sessions):
+            session.drain(status_of(going), action, elsewhere)
         try:
             async with asyncio.timeout(self._config.drain_s):
                 await self._idle.wait()
@@ -109,12 +156,20 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
 
 
 class PerceptionServer:
-    """A listening server; `async with PerceptionServer(models, config) as server: ...`."""
+    """A listening server; `async with PerceptionServer(models, config) as server: ...`.
+
+    Raises:
+        ConfigurationError: a certificate, a key or the token file can't be used.
+    """
 
     def __init__(self, models: PerceptionModels, config: ServerConfig) -> None:
         self._config = config
+        self._credentials = None if config.tls is None else RenewingCredentials(config.tls).credentials()
+        self._access = None if config.tokens is None else AccessFile(config.tokens)
+        self._authenticator = Authenticator(self._access)
         self._service = PerceptionService(models, config)
         self._server: grpc.aio.Server | None = None
+        self._watch: asyncio.Task[None] | None = None
         self.port = 0
 
     async def __aenter__(self) -> PerceptionServer:
@@ -124,25 +179,41 @@ class PerceptionServer:
             ConfigurationError: if the address can't be bound.
         """
         self._server = grpc.aio.server(
-            options=server_options(self._config.max_message_bytes), compression=grpc.Compression.NoCompression
+            interceptors=[AuthenticationInterceptor(self._authenticator)],
+            options=server_options(self._config.max_message_bytes),
+            maximum_concurrent_rpcs=self._config.shares.streams + SPARE_RPCS,
+            compression=grpc.Compression.NoCompression,
         )
         pb_grpc.add_PerceptionServiceServicer_to_server(self._service, self._server)
         try:
-            self.port = self._server.add_insecure_port(self._config.address)
+            if self._credentials is None:
+                self.port = self._server.add_insecure_port(self._config.address)
+            else:
+                self.port = self._server.add_secure_port(self._config.address, self._credentials)
         except RuntimeError as error:
             raise ConfigurationError(
                 f"can't listen on {self._config.address}: the port is taken or the address is not this "
                 "machine's; choose another with --listen"
             ) from error
         await self._server.start()
+        if self._access is not None:
+            self._watch = asyncio.create_task(self._watch_access(self._access))
         return self
 
     async def __aexit__(self, *exc_info: object) -> None:
         """Answers what is in flight, sends clients away, stops."""
+        if self._watch is not None:
+            self._watch.cancel()
         await self._service.drain()
         if self._server is not None:
             await self._server.stop(grace=0.5)
         self._service.close()
+
+    async def _watch_access(self, access: AccessFile) -> None:
+        while True:
+            await asyncio.sleep(self._config.access_check_s)
+            if access.refresh():
+                self._service.send_away_unknown(self._authenticator)
 
 
 async def serve_until_signal(models: PerceptionModels, config: ServerConfig, announce: Callable[[str], None]) -> None:

@@ -9,16 +9,20 @@ import asyncio
 import logging
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
 from google.rpc import code_pb2, status_pb2
 
+from cable_rpc.cloud.admission import AdmissionControl, StreamShare
+from cable_rpc.cloud.bounds import check_codec_config, check_hello, check_task
+from cable_rpc.cloud.limits import ANYBODY, Identity
 from cable_rpc.cloud.perception import Perception, PerceptionModels
+from cable_rpc.cloud.public_text import log_text, public_text
 from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
-from cable_rpc.errors import CableError, ProtocolError
+from cable_rpc.errors import CableError, ProtocolError, Refusal
 from cable_rpc.wire.convert import (
     PROTOCOL_REVISION,
     detections_to_messages,
@@ -44,6 +48,8 @@ class SessionLimits:
     hello_timeout_s: float = 10.0
     heartbeat_s: float = 5.0
     close_timeout_s: float = 5.0
+    idle_timeout_s: float = 300.0
+    """A client that has nothing unanswered and sends nothing for so long is sent away."""
 
     def flow(self) -> pb.FlowUpdate:
         """The limits as the client is told them."""
@@ -64,19 +70,38 @@ def model_infos(models: PerceptionModels) -> list[pb.ModelInfo]:
     """The hosted models as the client is told them."""
     kinds = ((models.detector, pb.RESULT_KIND_DETECTION), (models.segmenter, pb.RESULT_KIND_SEGMENTATION))
     return [
-        pb.ModelInfo(name=model.name, revision=model.revision, device=model.device, result_kind=kind)
+        pb.ModelInfo(name=public_text(model.name), revision=model.revision, device=model.device, result_kind=kind)
         for model, kind in kinds
     ]
 
 
 class PerceptionSession:
-    """Decodes, perceives and answers one stream; owns nothing that outlives it."""
+    """Decodes, perceives and answers one stream; owns nothing that outlives it.
 
-    def __init__(self, models: PerceptionModels, limits: SessionLimits, decode_executor: Executor) -> None:
+    Args:
+        models: what answers.
+        limits: of this stream.
+        decode_executor: where decoding runs.
+        admission: counts the streams of the server; None = one that refuses nothing.
+        identity: whose stream it is.
+    """
+
+    def __init__(
+        self,
+        models: PerceptionModels,
+        limits: SessionLimits,
+        decode_executor: Executor,
+        *,
+        admission: AdmissionControl | None = None,
+        identity: Identity = ANYBODY,
+    ) -> None:
         self.session_id = uuid.uuid4().hex[:12]
         self._models = models
         self._limits = limits
         self._executor = decode_executor
+        self._admission = admission or AdmissionControl()
+        self.identity = identity
+        self._share: StreamShare | None = None
         self._outbound: asyncio.Queue[Response | asyncio.Future[Response] | None] = asyncio.Queue()
         self._newest: _Accepted | None = None
         self._newest_arrived = asyncio.Event()
@@ -87,9 +112,10 @@ class PerceptionSession:
         self._last_sequence: int | None = None
         self._keyframe_requested = False
         self._closing = False
+        self._heard_s = time.monotonic()
         self._awaited: asyncio.Future[Any] | None = None
 
-    async def run(self, requests: AsyncIterator[pb.StreamPerceptionRequest]) -> AsyncIterator[Response]:
+    async def run(self, requests: AsyncIterator[pb.StreamPerceptionRequest]) -> AsyncGenerator[Response, None]:
         """Serves the stream until the client ends it, breaks a rule, or `drain` is called."""
         reader = asyncio.create_task(self._read_all(requests))
         inference = asyncio.create_task(self._infer_newest())
@@ -101,16 +127,27 @@ class PerceptionSession:
                 if task is not None:
                     task.cancel()
             await asyncio.gather(reader, inference, return_exceptions=True)
+            if self._share is not None:
+                self._share.release()
             self._models.forget_stream(self.session_id)
             if self._decoder is not None:
                 # Cancelling the reader does not stop a decode under way: closing waits for it, off the loop.
                 await asyncio.to_thread(self._decoder.close)
 
-    def drain(self, status: status_pb2.Status, action: pb.CloseAction) -> None:
-        """Tells the client to go; pending frames are still answered, new ones are ignored."""
+    def drain(self, status: status_pb2.Status, action: pb.CloseAction, alternative_target: str = "") -> None:
+        """Tells the client to go; pending frames are still answered, new ones are ignored.
+
+        Args:
+            status: why.
+            action: what the client is to do.
+            alternative_target: another server, "host:port"; only with MOVE.
+        """
         if not self._closing:
             self._closing = True
-            self._send(Response(closing=pb.Closing(status=status, action=action)))
+            self._heard_s = time.monotonic()
+            status.message = public_text(status.message)
+            closing = pb.Closing(status=status, action=action, alternative_target=alternative_target)
+            self._send(Response(closing=closing))
 
     # -- outbound ---------------------------------------------------------------------------------------------
 
@@ -121,12 +158,36 @@ class PerceptionSession:
                 self._awaited = asyncio.ensure_future(self._outbound.get())
             done, _ = await asyncio.wait({self._awaited}, timeout=self._limits.heartbeat_s)
             if not done:
-                return Response(flow_update=self._limits.flow())
+                if self._is_overdue():
+                    return None
+                if not self._closing:
+                    return Response(flow_update=self._flow())
+                continue
             item, self._awaited = self._awaited.result(), None
             if not isinstance(item, asyncio.Future):
                 return item
             item.add_done_callback(self._release_credit)
             self._awaited = item
+
+    def _is_overdue(self) -> bool:
+        """True when a client that was sent away has not gone; sends away one that has long been silent."""
+        silent_s = time.monotonic() - self._heard_s
+        if self._in_flight:
+            return False
+        if self._closing:
+            return silent_s > self._limits.close_timeout_s
+        if silent_s > self._limits.idle_timeout_s:
+            text = f"no message for {silent_s:.0f} s; connect again when there are frames"
+            log.info("session %s: %s", self.session_id, text)
+            self.drain(status_pb2.Status(code=code_pb2.DEADLINE_EXCEEDED, message=text), pb.CLOSE_ACTION_RESUME)
+        return False
+
+    def _flow(self) -> pb.FlowUpdate:
+        """The limits of this stream as the client is told them."""
+        flow = self._limits.flow()
+        if self._share is not None:
+            flow.max_frame_rate = self._share.frame_rate_advice
+        return flow
 
     def _release_credit(self, _: asyncio.Future[Response]) -> None:
         self._in_flight -= 1
@@ -138,26 +199,35 @@ class PerceptionSession:
 
     async def _read_all(self, requests: AsyncIterator[pb.StreamPerceptionRequest]) -> None:
         try:
+            self._share = self._admission.open_stream(self.identity)
             await self._read_hello(requests)
             async for request in requests:
+                self._heard_s = time.monotonic()
                 if self._closing:
                     continue
                 if request.WhichOneof("payload") == "goodbye":
                     break
                 await self._handle(request)
+        except Refusal as error:
+            log.warning("session %s of %s refused: %s", self.session_id, self.identity.name, error)
+            await self._close(requests, status_of(error), pb.CLOSE_ACTION_RESUME)
         except CableError as error:
             log.info("session %s closed: %s", self.session_id, error)
-            await self._close(requests, status_of(error))
+            await self._close(requests, status_of(error), pb.CLOSE_ACTION_STOP)
         except Exception:
             log.exception("session %s failed", self.session_id)
-            await self._close(
-                requests, status_pb2.Status(code=code_pb2.INTERNAL, message="internal error; see the server's log")
-            )
+            internal = status_pb2.Status(code=code_pb2.INTERNAL, message="internal error; see the server's log")
+            await self._close(requests, internal, pb.CLOSE_ACTION_STOP)
         finally:
             self._outbound.put_nowait(None)
 
-    async def _close(self, requests: AsyncIterator[pb.StreamPerceptionRequest], status: status_pb2.Status) -> None:
-        self.drain(status, pb.CLOSE_ACTION_STOP)
+    async def _close(
+        self,
+        requests: AsyncIterator[pb.StreamPerceptionRequest],
+        status: status_pb2.Status,
+        action: pb.CloseAction,
+    ) -> None:
+        self.drain(status, action)
         # Ending the call while the client still writes would replace our status by a broken stream (grpc #36066).
         try:
             async with asyncio.timeout(self._limits.close_timeout_s):
@@ -183,12 +253,15 @@ class PerceptionSession:
                 f"the client speaks protocol revision {hello.protocol_revision}, this server {PROTOCOL_REVISION}; "
                 "update the older one"
             )
+        check_hello(hello)
         self._configure(hello.codec_config)
         self._task = hello.task_config
+        self._heard_s = time.monotonic()
         log.info(
-            "session %s: %s %s %dx%d",
+            "session %s of %s: %s %s %dx%d",
             self.session_id,
-            hello.client_id or "unnamed client",
+            self.identity.name,
+            log_text(hello.client_id) or "unnamed client",
             pb.Codec.Name(self._codec),
             hello.codec_config.width,
             hello.codec_config.height,
@@ -198,13 +271,16 @@ class PerceptionSession:
                 welcome=pb.Welcome(
                     protocol_revision=PROTOCOL_REVISION,
                     session_id=self.session_id,
-                    flow=self._limits.flow(),
+                    flow=self._flow(),
                     models=model_infos(self._models),
                 )
             )
         )
 
     def _configure(self, config: pb.CodecConfig) -> None:
+        check_codec_config(config, self._limits.max_pixels)
+        if self._share is not None:
+            self._share.announce(config.width, config.height, config.frame_rate)
         decoder = StreamDecoder(config, self._limits.max_pixels)
         if self._decoder is not None:
             self._decoder.close()
@@ -216,6 +292,7 @@ class PerceptionSession:
         if kind == "frame":
             await self._accept(request.frame)
         elif kind == "task_config":
+            check_task(request.task_config)
             self._task = request.task_config
         elif kind == "codec_config":
             self._configure(request.codec_config)
@@ -230,11 +307,15 @@ class PerceptionSession:
             )
         if self._last_sequence is not None and frame.sequence <= self._last_sequence:
             raise ProtocolError(f"sequence must rise: {frame.sequence} came after {self._last_sequence}")
+        wait_s = self._share.take_frame(len(frame.data)) if self._share is not None else 0.0
         self._last_sequence = frame.sequence
         self._in_flight += 1
         answer: asyncio.Future[Response] = asyncio.get_running_loop().create_future()
         self._outbound.put_nowait(answer)
         timing = pb.ServerTiming(receive_time_ns=received_ns)
+        if wait_s:
+            # Not reading on is what slows the client down: its credit is bounded.
+            await asyncio.sleep(wait_s)
         try:
             decoded = await self._decode(frame, timing)
         except FrameRejection as rejection:
@@ -371,7 +452,7 @@ def _reject(
         answer,
         Response(
             frame_rejected=pb.FrameRejected(
-                sequence=frame.sequence, reason=rejection.reason, message=str(rejection), timing=timing
+                sequence=frame.sequence, reason=rejection.reason, message=public_text(str(rejection)), timing=timing
             )
         ),
     )

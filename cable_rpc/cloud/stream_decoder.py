@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from cable_codecs import STILL_CODECS, CodecError, CodecParameters, RegionTreatment, TreatedDecoder
 
+from cable_rpc.cloud.bounds import check_codec_config
 from cable_rpc.errors import FrameError, ProtocolError
 from cable_rpc.types import BoolMask, Image, RoiMask
 from cable_rpc.wire.convert import codec_name, region_from_message
@@ -44,13 +45,7 @@ class StreamDecoder:
 
     def __init__(self, config: pb.CodecConfig, max_pixels: int) -> None:
         name = codec_name(config.codec)
-        if config.width == 0 or config.height == 0:
-            raise ProtocolError(f"CodecConfig asks for {config.width}x{config.height}; both sides must be positive")
-        if config.width * config.height > max_pixels:
-            raise ProtocolError(
-                f"CodecConfig asks for {config.width}x{config.height} = {config.width * config.height} pixels, "
-                f"this server accepts {max_pixels}; stream at a lower resolution"
-            )
+        check_codec_config(config, max_pixels)
         self._height, self._width = config.height, config.width
         self._is_video = name not in STILL_CODECS
         treatment = treatment_from_message(config.treatment) if config.HasField("treatment") else NOTHING_BUT_BLACK

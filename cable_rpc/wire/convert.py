@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 from cable_codecs import CodecError, decode_mask, encode_mask
-from google.rpc import code_pb2, status_pb2
+from google.rpc import code_pb2, error_details_pb2, status_pb2
 
-from cable_rpc.errors import CableError, ProtocolError
+from cable_rpc.errors import CableError, ProtocolError, Refusal
 from cable_rpc.types import CameraIntrinsics, Detections, EgoMotion, PrefillCost, RoiMask, Segmentation
 from cable_rpc.wire.uncertainty import decode_uncertainty, encode_uncertainty
 from cable_rpc.wire.v1 import perception_pb2 as pb
@@ -179,9 +179,23 @@ def intrinsics_to_message(intrinsics: CameraIntrinsics) -> pb.CameraIntrinsics:
 
 
 def status_of(error: CableError) -> status_pb2.Status:
-    """The in-band status that an error travels as."""
+    """The in-band status that an error travels as; a refusal brings a google.rpc.RetryInfo."""
     number, _ = error.code.value
-    return status_pb2.Status(code=number, message=str(error))
+    status = status_pb2.Status(code=number, message=str(error))
+    if isinstance(error, Refusal):
+        retry = error_details_pb2.RetryInfo()
+        retry.retry_delay.FromNanoseconds(round(error.retry_after_s * 1e9))
+        status.details.add().Pack(retry)
+    return status
+
+
+def retry_after_s(status: status_pb2.Status) -> float | None:
+    """The seconds after which the peer may ask again; None where the status does not say."""
+    for detail in status.details:
+        retry = error_details_pb2.RetryInfo()
+        if detail.Unpack(retry):
+            return retry.retry_delay.ToNanoseconds() / 1e9
+    return None
 
 
 def status_code_name(status: status_pb2.Status) -> str:
