@@ -14,7 +14,17 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from cable_rpc.cli.connection_options import (
+    Tls,
+    TlsCa,
+    TlsCert,
+    TlsKey,
+    TlsServerName,
+    TokenFile,
+    client_security,
+)
 from cable_rpc.cli.machine import BackEnd, Extra, Hardware, MachineReport, Verdict, examine_machine
+from cable_rpc.cli.server_report import ask_and_print
 
 SCHEMA_VERSION = 1
 STATE_STYLES = {"ready": "bold green", "partly": "bold yellow", "missing": "bold red"}
@@ -23,6 +33,16 @@ ABSENT = Text("not installed", style="dim")
 
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
+    server: Annotated[
+        str | None,
+        typer.Option(help="Ask this server who it is instead, and say what is in the way.", metavar="HOST:PORT"),
+    ] = None,
+    tls: Tls = False,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    tls_server_name: TlsServerName = "",
+    token_file: TokenFile = None,
 ) -> None:
     """Say what this machine can do as edge, as cloud and for studies.
 
@@ -30,7 +50,16 @@ def doctor(
     where something is missing.
 
     Example: [bold]cable-rpc doctor --json | jq '.verdicts'[/bold]
+
+    Is that server there, and does it let me in? [bold]cable-rpc doctor --server grpcs://gpu-box:50051 --tls-ca ca.pem
+    --token-file token[/bold]
     """
+    if server is not None:
+        security = client_security(
+            tls=tls, ca=tls_ca, certificate=tls_cert, key=tls_key, server_name=tls_server_name, token_file=token_file
+        )
+        ask_and_print(server, security, as_json=as_json)
+        return
     report = examine_machine()
     if as_json:
         print(json.dumps({"schema_version": SCHEMA_VERSION, **asdict(report)}, indent=2))

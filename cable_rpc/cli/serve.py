@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
+import sys
 from typing import Annotated
 
 import typer
 
+from cable_rpc.cli.serve_security import (
+    DrainTo,
+    IdentityByteRate,
+    IdentityFrameRate,
+    IdentityPixelRate,
+    IdentityStreams,
+    MaxPixelRate,
+    MaxStreams,
+    TlsCert,
+    TlsClientCa,
+    TlsKey,
+    Tokens,
+    check_exposure,
+)
 from cable_rpc.errors import ConfigurationError
 
 
@@ -36,6 +50,17 @@ def serve(
     min_score: Annotated[float, typer.Option(help="Detections below are dropped.", min=0.0, max=1.0)] = 0.4,
     max_in_flight: Annotated[int, typer.Option(help="Unanswered frames granted to a client.", min=1)] = 2,
     max_frame_bytes: Annotated[int, typer.Option(help="Largest coded frame accepted.", min=1024)] = 2 << 20,
+    max_streams: MaxStreams = 64,
+    max_pixels_per_s: MaxPixelRate = None,
+    identity_streams: IdentityStreams = None,
+    identity_frames_per_s: IdentityFrameRate = None,
+    identity_pixels_per_s: IdentityPixelRate = None,
+    identity_bytes_per_s: IdentityByteRate = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    tls_client_ca: TlsClientCa = None,
+    tokens: Tokens = None,
+    drain_to: DrainTo = "",
     insecure: Annotated[
         bool,
         typer.Option(
@@ -48,24 +73,42 @@ def serve(
     Example: [bold]cable-rpc serve --device cuda --segmenter lisa:Senqiao/LISA_Plus_7b
     --detector rtdetr:PekingU/rtdetr_r50vd[/bold]
 
-    From other machines: add [bold]--listen 0.0.0.0:50051 --insecure[/bold]. Without pruning of tokens:
+    From other machines: add [bold]--listen 0.0.0.0:50051 --tls-cert server.pem --tls-key server.key
+    --tokens tokens.txt[/bold]; docs/security.md shows how to make them. Without pruning of tokens:
     [bold]--segmenter 'lisa:FOLDER?image_tokens=all&sam_windows=all'[/bold]
     """
-    if not (insecure or is_loopback(listen)):
-        raise ConfigurationError(
-            f"--listen {listen} is reachable from other machines and this server speaks plain text; "
-            "add --insecure if the network is trusted (a VPN or a lab), or listen on 127.0.0.1"
-        )
+    exposure = check_exposure(listen, tls=tls_cert is not None, tokens=tokens is not None, insecure=insecure)
+    if exposure is not None:
+        print(f"cable-rpc: {exposure}", file=sys.stderr)
     try:
         import onnxruntime  # noqa: F401 - asked for here so that its absence gets a sentence
     except ModuleNotFoundError as error:
         raise ConfigurationError("serving needs the cloud extra: pip install 'cable-rpc[cloud]'") from error
     from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segmenter
+    from cable_rpc.cloud.limits import UNLIMITED, IdentityLimits, ServerLimits
     from cable_rpc.cloud.model_runner import ThreadModelRunner
     from cable_rpc.cloud.perception import PerceptionModels
     from cable_rpc.cloud.service import ServerConfig, serve_until_signal
     from cable_rpc.cloud.session import SessionLimits
+    from cable_rpc.cloud.tls import TlsFiles
+    from cable_rpc.cloud.tokens import AccessFile
 
+    tls = TlsFiles.from_flags(tls_cert, tls_key, tls_client_ca)
+    # Loading models takes long; what is wrong with the files is said before.
+    if tls is not None:
+        tls.load()
+    if tokens is not None:
+        AccessFile(tokens)
+    shares = ServerLimits(
+        streams=max_streams,
+        pixels_per_s=max_pixels_per_s or UNLIMITED,
+        identity=IdentityLimits(
+            identity_streams or UNLIMITED,
+            identity_frames_per_s or UNLIMITED,
+            identity_pixels_per_s or UNLIMITED,
+            identity_bytes_per_s or UNLIMITED,
+        ),
+    )
     options = BackendOptions(device=device, threads=threads, min_score=min_score)
     # The detector first: it is loaded in a moment, and what is wrong with it should not wait for a large segmenter.
     hosted_detector = load_detector(detector, options)
@@ -74,16 +117,7 @@ def serve(
         hosted_detector, hosted_segmenter, ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
     )
     limits = SessionLimits(max_in_flight=max_in_flight, max_frame_bytes=max_frame_bytes, default_min_score=min_score)
-    config = ServerConfig(address=listen, limits=limits)
+    config = ServerConfig(
+        address=listen, limits=limits, shares=shares, tls=tls, tokens=tokens, alternative_target=drain_to
+    )
     asyncio.run(serve_until_signal(models, config, announce=lambda line: print(line, flush=True)))
-
-
-def is_loopback(address: str) -> bool:
-    """True when HOST:PORT can only be reached from this machine."""
-    host = address.rpartition(":")[0].strip("[]")
-    if host == "localhost" or address.startswith("unix:"):
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -13,11 +13,21 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from cable_rpc.cli.connection_options import (
+    Tls,
+    TlsCa,
+    TlsCert,
+    TlsKey,
+    TlsServerName,
+    TokenFile,
+    client_security,
+)
 from cable_rpc.cli.progress import RunProgress
 from cable_rpc.cli.roi_options import region_treatment, roi_config
 from cable_rpc.cli.skip_bad import SkipBad, bad_frames_listed
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.source import SOURCE_FORMS, FrameSource, open_source
+from cable_rpc.edge.channel import SecureTarget
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.strategies import STRATEGIES
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
@@ -36,7 +46,9 @@ def stream(
             metavar="SCHEME:...",
         ),
     ],
-    target: Annotated[str, typer.Option(help="HOST:PORT of the server.", metavar="HOST:PORT")] = "127.0.0.1:50051",
+    target: Annotated[
+        str, typer.Option(help="HOST:PORT of the server, or grpcs://HOST:PORT with TLS.", metavar="HOST:PORT")
+    ] = "127.0.0.1:50051",
     codec: Annotated[str, typer.Option(help=" | ".join(CODECS_BY_NAME) + "; `doctor` says which run here.")] = "h264",
     quality: Annotated[
         int | None,
@@ -102,6 +114,12 @@ def stream(
         float, typer.Option(help="Detections below are not sent; can only raise the server's.", min=0.0, max=1.0)
     ] = 0.0,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the server.", min=0.1)] = 10.0,
+    tls: Tls = False,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    tls_server_name: TlsServerName = "",
+    token_file: TokenFile = None,
     client_id: Annotated[str, typer.Option(help="Name of this camera in the server's logs.")] = "",
     evaluate: Annotated[
         bool,
@@ -114,12 +132,19 @@ def stream(
     """Stream a camera through the loop and measure what it costs.
 
     Example: [bold]cable-rpc stream --source video:drive.mp4 --target gpu-box:50051 --codec h264[/bold]
+
+    With TLS and a token: [bold]--target grpcs://gpu-box:50051 --tls-ca ca.pem --token-file token[/bold]
     """
     if pace not in {"lockstep", "realtime"}:
         raise ConfigurationError(f"--pace is '{pace}'; use lockstep or realtime")
     if codec not in CODECS_BY_NAME:
         raise ConfigurationError(f"--codec is '{codec}'; use one of {', '.join(CODECS_BY_NAME)}")
     frame_size = parse_size(size)
+    security = client_security(
+        tls=tls, ca=tls_ca, certificate=tls_cert, key=tls_key, server_name=tls_server_name, token_file=token_file
+    )
+    for warning in SecureTarget(target, security).warnings:
+        print(f"cable-rpc: {warning}", file=sys.stderr)
     config = StreamRunConfig(
         target=target,
         out=out,
@@ -138,6 +163,7 @@ def stream(
         client_id=client_id,
         connect_timeout_s=connect_timeout,
         evaluate=evaluate,
+        security=security,
         command_line=shlex.join(["cable-rpc", *sys.argv[1:]]),
     )
     with bad_frames_listed(skip_bad) as bad_frames:

@@ -13,15 +13,16 @@ import grpc
 from cable_codecs import STILL_CODECS, RegionTreatment
 
 import cable_rpc
+from cable_rpc.edge.channel import PLAIN, ClientSecurity, SecureTarget, connection_error
 from cable_rpc.errors import ProtocolError, RemoteError
 from cable_rpc.types import CameraIntrinsics
 from cable_rpc.wire.answers import FrameAnswer
-from cable_rpc.wire.channel import client_options
 from cable_rpc.wire.clock import ClockOffset, ClockOffsetEstimator, ClockSample
 from cable_rpc.wire.convert import (
     CODECS_BY_NAME,
     PROTOCOL_REVISION,
     intrinsics_to_message,
+    retry_after_s,
     status_code_name,
 )
 from cable_rpc.wire.treatment import treatment_to_message
@@ -77,7 +78,16 @@ class PerceptionClient:
     Frames are sent with `send` once `acquire_credit` has granted a place; `answers` yields one `FrameAnswer` for
     each of them, and the caller gives the place back with `release_credit` when it has applied the answer.
 
+    Args:
+        target: ``grpcs://host:port``, ``grpc://host:port`` or ``host:port``.
+        request: what is asked for.
+        security: TLS and token.
+        window: unanswered frames at most, where that is less than the server grants.
+        connect_timeout_s: for everything up to the Welcome.
+        silence_timeout_s: after which the connection counts as lost.
+
     Raises:
+        ConfigurationError: target, certificates or token can't be used.
         RemoteError: the server can't be reached, refused the session, or vanished.
     """
 
@@ -86,11 +96,13 @@ class PerceptionClient:
         target: str,
         request: SessionRequest,
         *,
+        security: ClientSecurity = PLAIN,
         window: int | None = None,
         connect_timeout_s: float = 10.0,
         silence_timeout_s: float = SILENCE_TIMEOUT_S,
     ) -> None:
         self.target = target
+        self._way = SecureTarget(target, security)
         self._request = request
         self._window = window
         self._connect_timeout_s = connect_timeout_s
@@ -109,19 +121,17 @@ class PerceptionClient:
 
     async def __aenter__(self) -> PerceptionClient:
         async with AsyncExitStack() as stack:
-            channel = await stack.enter_async_context(grpc.aio.insecure_channel(self.target, options=client_options()))
-            clock_channel = await stack.enter_async_context(
-                grpc.aio.insecure_channel(self.target, options=client_options(own_connection=True))
-            )
+            channel = await stack.enter_async_context(self._way.open_channel())
+            clock_channel = await stack.enter_async_context(self._way.open_channel(own_connection=True))
             self._clock_stub = pb_grpc.PerceptionServiceStub(clock_channel)
             stub = pb_grpc.PerceptionServiceStub(channel)
             try:
                 async with asyncio.timeout(self._connect_timeout_s):
-                    await channel.channel_ready()
-                    self.server_info = await stub.GetServerInfo(pb.GetServerInfoRequest())
+                    await self._way.wait_until_ready(channel)
+                    self.server_info = await stub.GetServerInfo(pb.GetServerInfoRequest(), metadata=self._way.metadata)
                     for _ in range(CLOCK_SAMPLES_AT_START):
                         await self._sample_clock()
-                    self._call: Any = stub.StreamPerception()
+                    self._call: Any = stub.StreamPerception(metadata=self._way.metadata)
                     await self._open()
             except TimeoutError:
                 raise RemoteError(
@@ -129,7 +139,7 @@ class PerceptionClient:
                     "there, and is the port open?"
                 ) from None
             except grpc.aio.AioRpcError as error:
-                raise _broken(self.target, error) from error
+                raise connection_error(self.target, error) from error
             stack.push_async_callback(_cancelled, asyncio.create_task(self._keep_clock()))
             self._stack = stack.pop_all()
         return self
@@ -180,7 +190,7 @@ class PerceptionClient:
                 if answer is not None:
                     yield answer
         except grpc.aio.AioRpcError as error:
-            raise _broken(self.target, error) from error
+            raise connection_error(self.target, error) from error
 
     def _understand(self, response: pb.StreamPerceptionResponse) -> FrameAnswer | None:
         received_ns = time.monotonic_ns()
@@ -233,11 +243,13 @@ class PerceptionClient:
         except asyncio.InvalidStateError as error:
             raise RemoteError(f"{self.target} has ended the stream") from error
         except grpc.aio.AioRpcError as error:
-            raise _broken(self.target, error) from error
+            raise connection_error(self.target, error) from error
 
     async def _sample_clock(self) -> None:
         sent_ns = time.monotonic_ns()
-        response = await self._clock_stub.SyncClock(pb.SyncClockRequest(client_send_time_ns=sent_ns))
+        response = await self._clock_stub.SyncClock(
+            pb.SyncClockRequest(client_send_time_ns=sent_ns), metadata=self._way.metadata
+        )
         self._clock.add(
             ClockSample(sent_ns, response.server_receive_time_ns, response.server_send_time_ns, time.monotonic_ns())
         )
@@ -256,9 +268,11 @@ async def _cancelled(task: asyncio.Task[None]) -> None:
     await asyncio.gather(task, return_exceptions=True)
 
 
-def _broken(target: str, error: grpc.aio.AioRpcError) -> RemoteError:
-    return RemoteError(f"the connection to {target} broke: {error.code().name} {error.details() or ''}".rstrip())
-
-
 def _closed(target: str, closing: pb.Closing) -> RemoteError:
-    return RemoteError(f"{target} closed the session: {status_code_name(closing.status)}: {closing.status.message}")
+    text = f"{target} closed the session: {status_code_name(closing.status)}: {closing.status.message}"
+    wait_s = retry_after_s(closing.status)
+    if wait_s is not None:
+        text += f"; try again in {wait_s:.0f} s"
+    if closing.alternative_target:
+        text += f", at {closing.alternative_target}"
+    return RemoteError(text)

@@ -18,6 +18,7 @@ from cable_codecs import STILL_CODECS, CodecParameters, RegionTreatment, default
 import cable_rpc
 from cable_rpc.data.source import FrameSource
 from cable_rpc.edge.capture import Capture
+from cable_rpc.edge.channel import PLAIN, ClientSecurity
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder
 from cable_rpc.edge.roi_config import RoiConfig
@@ -37,6 +38,7 @@ from cable_rpc.study.summary import RunSummary, summarise, write_summary
 from cable_rpc.study.transport_counters import measure_link
 from cable_rpc.study.transport_estimate import TransportBytes, estimate_exchanges
 from cable_rpc.types import CameraIntrinsics, Frame
+from cable_rpc.wire.address import Target
 
 RecordListener = Callable[[str, FrameRecord], None]
 """Is told ("stream" | "evaluate", record) after each frame of each pass."""
@@ -74,6 +76,8 @@ class StreamRunConfig:
     roi: RoiConfig = field(default_factory=RoiConfig)
     command_line: str = ""
     notes: tuple[str, ...] = ()
+    security: ClientSecurity = PLAIN
+    """TLS and token of the way to the server."""
 
 
 class StreamRun:
@@ -159,7 +163,7 @@ class StreamRun:
                 finally:
                     self._describe(client)
                     self._note_rate(encoder)
-                    self._measured_link = measure_link(config.target)
+                    self._measured_link = measure_link(Target.parse(config.target).address)
                     self._unsent = [
                         *(FrameRecord(index, 0, "dropped") for index in capture.dropped),
                         *(FrameRecord(index, 0, "lost") for index in streamer.unanswered),
@@ -204,7 +208,13 @@ class StreamRun:
             treatment=self._treatment,
         )
         window = None if realtime else 1
-        return PerceptionClient(config.target, request, window=window, connect_timeout_s=config.connect_timeout_s)
+        return PerceptionClient(
+            config.target,
+            request,
+            security=config.security,
+            window=window,
+            connect_timeout_s=config.connect_timeout_s,
+        )
 
     def _describe(self, client: PerceptionClient) -> None:
         offset = client.clock_offset

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from cable_rpc.cli.demo import local_server
-from cable_rpc.cli.serve import is_loopback
 from cable_rpc.errors import RemoteError
 from cable_rpc.study.run_record import read_frames
+from cable_rpc.wire.address import is_loopback
 
 
 def cable_rpc(*arguments: str, timeout: float = 90) -> subprocess.CompletedProcess[str]:
