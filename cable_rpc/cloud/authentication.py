@@ -11,11 +11,13 @@ from typing import Any, TypeAlias
 import grpc
 
 from cable_rpc.cloud.limits import ANYBODY, Identity
+from cable_rpc.cloud.throttled_log import ThrottledWarning
 from cable_rpc.cloud.tls import certificate_subject
 from cable_rpc.cloud.tokens import AccessFile
 from cable_rpc.errors import AuthenticationError
 
 log = logging.getLogger(__name__)
+warn_of_refusal = ThrottledWarning(log)
 
 OPEN_SERVICES = ("/grpc.health.v1.Health/",)
 """Probes of load balancers and orchestrators bring no token, and learn nothing but up or down."""
@@ -122,6 +124,6 @@ class AuthenticationInterceptor(grpc.aio.ServerInterceptor):
         try:
             identity = self._authenticator.identify(tokens_of(tuple(context.invocation_metadata() or ())), subject)
         except AuthenticationError as error:
-            log.warning("refused a call from %s: %s", context.peer(), error)
+            warn_of_refusal("refused a call from %s: %s", context.peer(), error)
             await context.abort(error.code, str(error))
         current_identity.set(identity)

@@ -22,6 +22,7 @@ from cable_rpc.cloud.limits import ANYBODY, Identity
 from cable_rpc.cloud.perception import Perception, PerceptionModels
 from cable_rpc.cloud.public_text import log_text, public_text
 from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
+from cable_rpc.cloud.throttled_log import ThrottledWarning
 from cable_rpc.errors import CableError, ProtocolError, Refusal
 from cable_rpc.wire.convert import (
     PROTOCOL_REVISION,
@@ -32,6 +33,7 @@ from cable_rpc.wire.convert import (
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
 log = logging.getLogger(__name__)
+warn_of_refusal = ThrottledWarning(log)
 
 Response = pb.StreamPerceptionResponse
 
@@ -209,7 +211,7 @@ class PerceptionSession:
                     break
                 await self._handle(request)
         except Refusal as error:
-            log.warning("session %s of %s refused: %s", self.session_id, self.identity.name, error)
+            warn_of_refusal("session %s of %s refused: %s", self.session_id, self.identity.name, error)
             await self._close(requests, status_of(error), pb.CLOSE_ACTION_RESUME)
         except CableError as error:
             log.info("session %s closed: %s", self.session_id, error)

@@ -18,7 +18,6 @@ from cable_rpc.wire.der import DerError, expiry_of_certificate
 from cable_rpc.wire.pem import certificates_in, load_authorities, load_key_pair
 
 from .certificates import Authority, Pair
-from .conftest import BrightBoxDetector
 from .secure_server import client, one_frame, serving
 
 FLAGS = ("--tls-cert", "--tls-key")
@@ -57,10 +56,6 @@ async def test_frames_travel_over_tls(authority: Authority, server_pair: Pair) -
         report = await ask_server(SecureTarget(f"grpcs://localhost:{server.port}", security), 5)
         assert report.tls
         assert report.models == ("bright", "boxes")
-
-
-class IdentityDetector(BrightBoxDetector):
-    seen: list[str]
 
 
 async def test_mutual_tls_names_the_client(authority: Authority, server_pair: Pair, client_pair: Pair) -> None:
