@@ -23,6 +23,7 @@ from cable_rpc.cloud.admission import AdmissionControl
 from cable_rpc.cloud.authentication import AuthenticationInterceptor, Authenticator, current_identity
 from cable_rpc.cloud.limits import ServerLimits
 from cable_rpc.cloud.perception import PerceptionModels
+from cable_rpc.cloud.request_bounds import RequestBounds
 from cable_rpc.cloud.session import PerceptionSession, SessionLimits, model_infos
 from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
 from cable_rpc.cloud.tokens import AccessFile
@@ -179,7 +180,7 @@ class PerceptionServer:
             ConfigurationError: if the address can't be bound.
         """
         self._server = grpc.aio.server(
-            interceptors=[AuthenticationInterceptor(self._authenticator)],
+            interceptors=[AuthenticationInterceptor(self._authenticator), RequestBounds()],
             options=server_options(self._config.max_message_bytes),
             maximum_concurrent_rpcs=self._config.shares.streams + SPARE_RPCS,
             compression=grpc.Compression.NoCompression,

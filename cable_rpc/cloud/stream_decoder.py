@@ -49,8 +49,8 @@ class StreamDecoder:
         self._height, self._width = config.height, config.width
         self._is_video = name not in STILL_CODECS
         treatment = treatment_from_message(config.treatment) if config.HasField("treatment") else NOTHING_BUT_BLACK
-        parameters = CodecParameters(name, config.width, config.height, config.frame_rate or 10.0)
         try:
+            parameters = CodecParameters(name, config.width, config.height, config.frame_rate or 10.0)
             self._decoder = TreatedDecoder(parameters, treatment)
         except CodecError as error:
             raise ProtocolError(str(error)) from error
