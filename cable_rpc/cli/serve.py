@@ -77,7 +77,8 @@ def serve(
     --tokens tokens.txt[/bold]; docs/security.md shows how to make them. Without pruning of tokens:
     [bold]--segmenter 'lisa:FOLDER?image_tokens=all&sam_windows=all'[/bold]
     """
-    exposure = check_exposure(listen, tls=tls_cert is not None, tokens=tokens is not None, insecure=insecure)
+    proof = tokens is not None or tls_client_ca is not None
+    exposure = check_exposure(listen, tls=tls_cert is not None, proof=proof, insecure=insecure)
     if exposure is not None:
         print(f"cable-rpc: {exposure}", file=sys.stderr)
     try:

@@ -40,13 +40,13 @@ DrainTo = Annotated[
 ]
 
 
-def check_exposure(listen: str, *, tls: bool, tokens: bool, insecure: bool) -> str | None:
+def check_exposure(listen: str, *, tls: bool, proof: bool, insecure: bool) -> str | None:
     """What is to be said about listening there.
 
     Args:
         listen: HOST:PORT.
         tls: whether the server speaks TLS.
-        tokens: whether clients need a token.
+        proof: whether clients must prove who they are, by token or certificate.
         insecure: whether --insecure was given.
 
     Returns:
@@ -58,13 +58,13 @@ def check_exposure(listen: str, *, tls: bool, tokens: bool, insecure: bool) -> s
     if is_loopback(listen):
         return None
     if tls:
-        return None
+        return None if proof else "everybody who reaches this port can use it; add --tokens or --tls-client-ca"
     if not insecure:
         raise ConfigurationError(
             f"--listen {listen} is reachable from other machines and this server would speak plain text; "
             "give --tls-cert and --tls-key, or add --insecure if the network is trusted (a VPN or a lab), "
             "or listen on 127.0.0.1"
         )
-    if tokens:
+    if proof:
         return "tokens over plain text can be taken by anybody on the way, so our clients won't send them; use TLS"
     return "everybody who reaches this port can use it and see what others stream (--insecure)"
