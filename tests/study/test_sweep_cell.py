@@ -176,6 +176,13 @@ def test_a_link_delays_answers_and_drops_what_finds_no_room(tmp_path: Path, monk
     assert result.metrics.retention[0, 1] == whole.metrics.retention[0, 1], "a dropped frame's objects are missed"
 
 
+def test_image_codecs_keep_a_target_rate_too(tmp_path: Path) -> None:
+    jpeg = replace(CELL, codec="jpeg", treatment=RegionTreatment.default_for(stateless=True), strategy="full-frame")
+    low, high = (measured(replace(jpeg, rate=RatePoint(bitrate_kbps=rate)), tmp_path) for rate in (150, 600))
+    assert low.uplink.total < high.uplink.total
+    assert low.sent.squared_error > high.sent.squared_error
+
+
 def test_clips_are_decoded_once_and_give_back_what_was_read(tmp_path: Path) -> None:
     clip = stored_clip(CLIP, tmp_path)
     before = (clip.folder / clip_store.FRAMES_FILE).stat().st_mtime_ns

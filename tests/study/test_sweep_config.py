@@ -179,7 +179,7 @@ def test_roi_settings_are_an_axis() -> None:
         (ONE + "grids: [{strategy: cable}]", "grids[0].strategy is unknown; did you mean strategies? known"),
         (ONE + "grids: [{strategies: cabel}]", "grids[0].strategies is 'cabel'; give one of cable, no-corridor"),
         (ONE + "grids: [{codecs: {h265: {}}}]", "grids[0].codecs.h265 is unknown; did you mean h264?"),
-        (ONE + "grids: [{codecs: {jpeg: {bitrate_kbps: 5}}}]", "jpeg has no rate control; give quality"),
+        (ONE + "grids: [{codecs: {webp-lossless: {bitrate_kbps: 5}}}]", "has no meaning for webp-lossless"),
         (ONE + "grids: [{upload_scale: .nan}]", "grids[0].upload_scale is nan; give a finite number of 0.0625..1"),
         (ONE + "grids: [{feedback_delay: [1, 0]}]", "grids[0].feedback_delay[1] is 0; give a whole number of 1..1000"),
         (ONE + "grids: [{fps: []}]", "grids[0].fps is empty; leave it out or give at least one value"),

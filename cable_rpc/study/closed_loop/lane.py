@@ -15,12 +15,10 @@ from cable_rpc.edge.frame_encoder import FrameEncoder, PreparedFrame
 from cable_rpc.edge.strategy import RoiStrategy
 from cable_rpc.errors import RemoteError
 from cable_rpc.study.closed_loop.models import LoadedModels
-from cable_rpc.study.closed_loop.session_in_process import SessionInProcess
+from cable_rpc.study.closed_loop.session_in_process import NOMINAL_DURATION_NS, SessionInProcess
 from cable_rpc.types import Detections, Image, Segmentation
 from cable_rpc.wire.answers import FrameAnswer
 from cable_rpc.wire.v1 import perception_pb2 as pb
-
-NOMINAL_DURATION_NS = 5_000_000
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,8 +81,8 @@ def codec_rates(codec: str, entry: Entry) -> tuple[RatePoint, ...]:
     if "quality" in keys:
         points += [RatePoint(quality) for quality in read_qualities(codec, keys["quality"])]
     if "bitrate_kbps" in keys:
-        if codec in STILL_CODECS:
-            raise keys["bitrate_kbps"].error(f"needs a video codec, {codec} has no rate control; give quality")
+        if codec == "webp-lossless":
+            raise keys["bitrate_kbps"].error("has no meaning for webp-lossless; leave it out")
         rates = [item.whole(1, HIGHEST_KBPS) for item in keys["bitrate_kbps"].items()]
         points += [RatePoint(bitrate_kbps=rate) for rate in rates]
     return tuple(dict.fromkeys(points)) or usual_rates(codec)
