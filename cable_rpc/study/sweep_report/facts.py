@@ -71,8 +71,8 @@ def settings_facts(cells: Sequence[MeasuredCell]) -> dict[str, CellFacts]:
 def byte_savings(methods: Mapping[str, Sequence[MeasuredCell]]) -> list[tuple[MeasuredCell, float]]:
     """Each cell with its saving of bytes against the same frames sent whole by the same codec at the same setting.
 
-    Left out: whole frames themselves, cells at a target bit rate (which is what they cost), and those whose whole
-    frames weren't measured.
+    Left out: whole frames themselves, cells at a target bit rate (which is what they cost) or a reduced upload (whose
+    pixels are others), and those whose whole frames weren't measured.
     """
     cells = [measured for members in methods.values() for measured in members]
     whole = {
@@ -83,7 +83,7 @@ def byte_savings(methods: Mapping[str, Sequence[MeasuredCell]]) -> list[tuple[Me
     savings = []
     for measured in cells:
         total = whole.get(like_key(measured.cell))
-        if is_repeated(measured.cell):
+        if is_repeated(measured.cell) or measured.cell.treatment.scale != 1.0:
             continue
         if measured.cell.strategy != ANCHOR_STRATEGY and measured.cell.rate.bitrate_kbps is None and total:
             savings.append((measured, 1.0 - facts_of([measured]).uplink.total / total))
