@@ -11,6 +11,7 @@ import sys
 import time
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -66,7 +67,11 @@ def all_lines(config: SweepConfig) -> Counter[str]:
 def start_child(folder: Path) -> subprocess.Popen[str]:
     program = f"import sweep_runner_for_tests as c; c.sweep_in_child({str(folder)!r}, {QUALITIES})"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), cheap.SECONDS_VARIABLE: "0.1"}
-    return subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True)
+    # Whoever runs the tests in the background ignores Ctrl-C, which children inherit.
+    heed_ctrl_c = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c
+    )
 
 
 def wait_for(child: subprocess.Popen[str], told: list[str]) -> None:
