@@ -12,7 +12,7 @@ help:            ## this list
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("CABLE-RPC needs Python 3.11 or newer, this is " + sys.version.split()[0] + "; try make PYTHON=python3.12") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cloud,study,trial,dev]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cloud,study,trial,tracing,dev]'
 	@touch $@
 
 setup: $(READY)  ## make .venv and install everything, pinned
