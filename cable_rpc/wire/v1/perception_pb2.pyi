@@ -62,6 +62,7 @@ class RejectReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REJECT_REASON_TOO_LARGE: _ClassVar[RejectReason]
     REJECT_REASON_INVALID_REGION: _ClassVar[RejectReason]
     REJECT_REASON_MODEL_FAILED: _ClassVar[RejectReason]
+    REJECT_REASON_OVERLOADED: _ClassVar[RejectReason]
 
 class CloseAction(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -104,6 +105,7 @@ REJECT_REASON_UNDECODABLE: RejectReason
 REJECT_REASON_TOO_LARGE: RejectReason
 REJECT_REASON_INVALID_REGION: RejectReason
 REJECT_REASON_MODEL_FAILED: RejectReason
+REJECT_REASON_OVERLOADED: RejectReason
 CLOSE_ACTION_UNSPECIFIED: CloseAction
 CLOSE_ACTION_RESUME: CloseAction
 CLOSE_ACTION_MOVE: CloseAction
@@ -178,7 +180,7 @@ class CameraIntrinsics(_message.Message):
     def __init__(self, focal_x: _Optional[float] = ..., focal_y: _Optional[float] = ..., center_x: _Optional[float] = ..., center_y: _Optional[float] = ...) -> None: ...
 
 class Welcome(_message.Message):
-    __slots__ = ("protocol_revision", "session_id", "flow", "models", "resume_token", "resume_window_s", "resumed", "features")
+    __slots__ = ("protocol_revision", "session_id", "flow", "models", "resume_token", "resume_window_s", "resumed", "features", "decoded_sequence")
     PROTOCOL_REVISION_FIELD_NUMBER: _ClassVar[int]
     SESSION_ID_FIELD_NUMBER: _ClassVar[int]
     FLOW_FIELD_NUMBER: _ClassVar[int]
@@ -187,6 +189,7 @@ class Welcome(_message.Message):
     RESUME_WINDOW_S_FIELD_NUMBER: _ClassVar[int]
     RESUMED_FIELD_NUMBER: _ClassVar[int]
     FEATURES_FIELD_NUMBER: _ClassVar[int]
+    DECODED_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     protocol_revision: int
     session_id: str
     flow: FlowUpdate
@@ -195,7 +198,8 @@ class Welcome(_message.Message):
     resume_window_s: float
     resumed: bool
     features: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, protocol_revision: _Optional[int] = ..., session_id: _Optional[str] = ..., flow: _Optional[_Union[FlowUpdate, _Mapping]] = ..., models: _Optional[_Iterable[_Union[ModelInfo, _Mapping]]] = ..., resume_token: _Optional[bytes] = ..., resume_window_s: _Optional[float] = ..., resumed: bool = ..., features: _Optional[_Iterable[str]] = ...) -> None: ...
+    decoded_sequence: int
+    def __init__(self, protocol_revision: _Optional[int] = ..., session_id: _Optional[str] = ..., flow: _Optional[_Union[FlowUpdate, _Mapping]] = ..., models: _Optional[_Iterable[_Union[ModelInfo, _Mapping]]] = ..., resume_token: _Optional[bytes] = ..., resume_window_s: _Optional[float] = ..., resumed: bool = ..., features: _Optional[_Iterable[str]] = ..., decoded_sequence: _Optional[int] = ...) -> None: ...
 
 class ModelInfo(_message.Message):
     __slots__ = ("name", "revision", "result_kind", "device")
