@@ -8,6 +8,14 @@ from typing import Annotated
 
 import typer
 
+from cable_rpc.cli.serve_scheduling import (
+    BatchWait,
+    DetectorBatch,
+    DetectorWorkers,
+    LatencyBound,
+    SegmenterBatch,
+    batch_policy,
+)
 from cable_rpc.cli.serve_security import (
     DrainTo,
     IdentityByteRate,
@@ -50,6 +58,11 @@ def serve(
     min_score: Annotated[float, typer.Option(help="Detections below are dropped.", min=0.0, max=1.0)] = 0.4,
     max_in_flight: Annotated[int, typer.Option(help="Unanswered frames granted to a client.", min=1)] = 2,
     max_frame_bytes: Annotated[int, typer.Option(help="Largest coded frame accepted.", min=1024)] = 2 << 20,
+    detector_batch: DetectorBatch = None,
+    segmenter_batch: SegmenterBatch = None,
+    detector_workers: DetectorWorkers = 1,
+    batch_wait: BatchWait = 0.0,
+    latency_bound: LatencyBound = 0.0,
     max_streams: MaxStreams = 64,
     max_pixels_per_s: MaxPixelRate = None,
     identity_streams: IdentityStreams = None,
@@ -87,10 +100,9 @@ def serve(
         raise ConfigurationError("serving needs the cloud extra: pip install 'cable-rpc[cloud]'") from error
     from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segmenter
     from cable_rpc.cloud.limits import UNLIMITED, IdentityLimits, ServerLimits
-    from cable_rpc.cloud.model_runner import ThreadModelRunner
     from cable_rpc.cloud.perception import PerceptionModels
     from cable_rpc.cloud.service import ServerConfig, serve_until_signal
-    from cable_rpc.cloud.session import SessionLimits
+    from cable_rpc.cloud.session_limits import SessionLimits
     from cable_rpc.cloud.tls import TlsFiles
     from cable_rpc.cloud.tokens import AccessFile
 
@@ -114,10 +126,18 @@ def serve(
     # The detector first: it is loaded in a moment, and what is wrong with it should not wait for a large segmenter.
     hosted_detector = load_detector(detector, options)
     hosted_segmenter = load_segmenter(segmenter, options)
-    models = PerceptionModels(
-        hosted_detector, hosted_segmenter, ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
+    models = PerceptionModels.in_process(
+        hosted_detector,
+        hosted_segmenter,
+        batch_policy(detector_batch, hosted_detector.device, batch_wait, latency_bound, detector_workers),
+        batch_policy(segmenter_batch, hosted_segmenter.device, batch_wait, latency_bound),
     )
-    limits = SessionLimits(max_in_flight=max_in_flight, max_frame_bytes=max_frame_bytes, default_min_score=min_score)
+    limits = SessionLimits(
+        max_in_flight=max_in_flight,
+        max_frame_bytes=max_frame_bytes,
+        default_min_score=min_score,
+        latency_bound_s=latency_bound,
+    )
     config = ServerConfig(
         address=listen, limits=limits, shares=shares, tls=tls, tokens=tokens, alternative_target=drain_to
     )

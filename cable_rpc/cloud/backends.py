@@ -64,8 +64,23 @@ class RegionDetector(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class SegmentationRequest:
+    """What `Segmenter.segment` is asked, as data."""
+
+    image: Image
+    """uint8 [H, W, 3] BGR."""
+    roi: BoolMask
+    """bool [H, W]."""
+    prompt: str
+    context: FrameContext
+
+
 class Segmenter(Protocol):
     """Answers with a mask of road actors.
+
+    One that makes no use of ``FrameContext.detections`` may say so with ``uses_detections = False``: it then runs
+    beside the detector and not after it, and gets no detections.
 
     One that keeps anything by ``FrameContext.stream`` may also have ``forget_stream(stream: str) -> None``: it is
     called when a session has ended, where ``segment`` runs and after its last frame, also for unknown streams.
@@ -81,6 +96,15 @@ class Segmenter(Protocol):
 
         The caller intersects the mask with the region.
         """
+        ...
+
+
+@runtime_checkable
+class BatchSegmenter(Protocol):
+    """A segmenter that answers several frames, of any sizes, prompts and streams, sooner than one after the other."""
+
+    def segment_batch(self, requests: Sequence[SegmentationRequest]) -> list[Segmentation]:
+        """One answer for each request, as `Segmenter.segment` gives it."""
         ...
 
 

@@ -5,6 +5,7 @@ torch and transformers are loaded with the model, not with this module.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +14,7 @@ import numpy as np
 from cable_models.embedded import embedded_segmenter_path
 from cable_models.errors import ModelError as LisaError
 
-from cable_rpc.cloud.backends import BackendOptions, FrameContext
+from cable_rpc.cloud.backends import BackendOptions, FrameContext, SegmentationRequest
 from cable_rpc.cloud.mask_confidence import mask_confidence, uncertainty_of, united_logits
 from cable_rpc.cloud.perception import DEFAULT_PROMPT
 from cable_rpc.cloud.spec_options import options_text, read_options
@@ -56,6 +57,8 @@ class LisaSegmenter:
         revision: which weights.
     """
 
+    uses_detections = False
+
     def __init__(self, pipeline: LisaPipeline, *, name: str, revision: str) -> None:
         self._pipeline = pipeline
         self.name = name
@@ -68,17 +71,29 @@ class LisaSegmenter:
         Raises:
             ModelError: the prompt is too long, the model can't answer it, or its logits are not numbers.
         """
+        return self.segment_batch([SegmentationRequest(image, roi, prompt, context)])[0]
+
+    def segment_batch(self, requests: Sequence[SegmentationRequest]) -> list[Segmentation]:
+        """See `BatchSegmenter`.
+
+        Raises:
+            ModelError: as `segment`; one bad request fails them all.
+        """
         from cable_models.lisa.pipeline import FrameRequest
 
-        if len(prompt) > MAX_PROMPT_CHARACTERS:
+        longest = max(len(request.prompt) for request in requests)
+        if longest > MAX_PROMPT_CHARACTERS:
             raise ModelError(
-                f"{self.name}: the prompt has {len(prompt)} characters, at most {MAX_PROMPT_CHARACTERS} are taken"
+                f"{self.name}: the prompt has {longest} characters, at most {MAX_PROMPT_CHARACTERS} are taken"
             )
+        frames = [
+            FrameRequest(request.image, request.roi, request.prompt, request.context.stream) for request in requests
+        ]
         try:
-            (answer,) = self._pipeline.segment([FrameRequest(image, roi, prompt, context.stream)])
+            answers = self._pipeline.segment(frames)
         except LisaError as error:
             raise ModelError(f"{self.name}: {error}") from error
-        return segmentation_of(answer, roi)
+        return [segmentation_of(answer, request.roi) for answer, request in zip(answers, requests, strict=True)]
 
     def forget_stream(self, stream: str) -> None:
         """Drops what is remembered of a session's answers."""

@@ -1,52 +1,45 @@
-"""Running a model off the event loop: one thread per model, so its calls queue instead of fighting for cores."""
+"""Running a model off the event loop, for all sessions of a server."""
 
 from __future__ import annotations
 
-import asyncio
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+Item = TypeVar("Item", contravariant=True)
+Answer = TypeVar("Answer", covariant=True)
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class ModelRun(Generic[T]):
+class ModelRun(Generic[Answer]):
     """A model's answer and what it took."""
 
-    value: T
+    value: Answer
     wait_ns: int
+    """In the model's queue."""
     run_ns: int
+    """Of the whole batch."""
     batch_size: int
+    start_time_ns: int = 0
+    """When the run began, on this machine's monotonic clock; 0 = not told."""
 
 
-class ModelRunner(Protocol):
+class ModelRunner(Protocol[Item, Answer]):
     """Hides whether a model runs in this process, in a batch with other sessions, or on another machine."""
 
-    async def infer(self, call: Callable[[], T]) -> ModelRun[T]:
-        """Runs ``call`` where the model lives; its exceptions come through."""
+    async def infer(self, take: Callable[[], Item | None]) -> ModelRun[Answer] | None:
+        """Queues for the model; ``take`` is called when the turn has come, so that it can give the newest frame.
+
+        Returns None where ``take`` had nothing to give. The model's exceptions come through. Cancelling it before its
+        turn leaves the queue.
+        """
         ...
 
-
-class ThreadModelRunner:
-    """One worker thread in this process; calls run one at a time, in order."""
-
-    def __init__(self, name: str) -> None:
-        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=name)
-
-    async def infer(self, call: Callable[[], T]) -> ModelRun[T]:
-        """See `ModelRunner`."""
-        queued_ns = time.monotonic_ns()
-
-        def timed() -> ModelRun[T]:
-            started_ns = time.monotonic_ns()
-            value = call()
-            return ModelRun(value, started_ns - queued_ns, time.monotonic_ns() - started_ns, 1)
-
-        return await asyncio.get_running_loop().run_in_executor(self._executor, timed)
+    async def call(self, function: Callable[[], T]) -> T:
+        """Runs something where the model runs, between its batches."""
+        ...
 
     def close(self) -> None:
-        """Ends the worker after its current call."""
-        self._executor.shutdown(wait=False, cancel_futures=True)
+        """Ends it after the batch that runs."""
+        ...

@@ -1,18 +1,20 @@
-"""The models' part of a frame: boxes, then a mask inside the region."""
+"""The models' part of a frame: its boxes, and a mask inside its region."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from cable_rpc.cloud.backends import Detector, FrameContext, RegionDetector, Segmenter
+from cable_rpc.cloud.backends import BatchSegmenter, Detector, FrameContext, SegmentationRequest, Segmenter
+from cable_rpc.cloud.batching import BatchingRunner, BatchPolicy
+from cable_rpc.cloud.model_batches import DetectionRequest, detect_batch, segment_batch
 from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
-from cable_rpc.errors import ModelError
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
 
 log = logging.getLogger(__name__)
@@ -28,11 +30,12 @@ class StageRun:
     wait_ns: int
     run_ns: int
     batch_size: int
+    start_time_ns: int = 0
 
     @classmethod
     def of(cls, stage: str, run: ModelRun[Any]) -> StageRun:
         """Names a model run."""
-        return cls(stage, run.wait_ns, run.run_ns, run.batch_size)
+        return cls(stage, run.wait_ns, run.run_ns, run.batch_size, run.start_time_ns)
 
     @classmethod
     def parts(cls, stage: str, run: ModelRun[Segmentation]) -> tuple[StageRun, ...]:
@@ -50,48 +53,126 @@ class Perception:
     stages: tuple[StageRun, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class PerceptionRequest:
+    """One picture for both models."""
+
+    image: Image
+    """uint8 [H, W, 3] BGR, outside the region what the treatment shows there."""
+    roi: BoolMask | None
+    """bool [H, W]; None = the whole frame."""
+    min_score: float
+    """Detections below are dropped."""
+    prompt: str = ""
+    """Sentence for the segmenter; empty = `DEFAULT_PROMPT`."""
+    sequence: int = 0
+    """The camera's frame number."""
+
+
+TakeRequest = Callable[[], PerceptionRequest | None]
+
+
 class PerceptionModels:
-    """The detector and the segmenter that all sessions of a server share."""
+    """The detector and the segmenter that all sessions of a server share.
+
+    Args:
+        detector: what the clients are told of it; it runs in ``detector_runner``.
+        segmenter: likewise.
+        detector_runner: where detection runs.
+        segmenter_runner: where segmentation runs.
+        side_by_side: a segmenter that needs no detections runs beside the detector; False = after it all the same,
+            where each model's time is to be measured alone.
+    """
 
     def __init__(
         self,
         detector: Detector,
         segmenter: Segmenter,
-        detector_runner: ModelRunner,
-        segmenter_runner: ModelRunner,
+        detector_runner: ModelRunner[DetectionRequest, Detections],
+        segmenter_runner: ModelRunner[SegmentationRequest, Segmentation],
+        *,
+        side_by_side: bool = True,
     ) -> None:
         self.detector = detector
         self.segmenter = segmenter
         self._detector_runner = detector_runner
         self._segmenter_runner = segmenter_runner
+        self._side_by_side = side_by_side and not getattr(segmenter, "uses_detections", True)
         self._farewells: set[asyncio.Task[None]] = set()
 
-    async def perceive(
-        self, image: Image, roi: BoolMask | None, *, prompt: str, min_score: float, sequence: int, stream: str = ""
-    ) -> Perception:
+    @classmethod
+    def in_process(
+        cls,
+        detector: Detector,
+        segmenter: Segmenter,
+        detector_batches: BatchPolicy | None = None,
+        segmenter_batches: BatchPolicy | None = None,
+        *,
+        side_by_side: bool = True,
+    ) -> PerceptionModels:
+        """Both models in threads of this process, in batches as the policies say; one frame at a time by default.
+
+        A segmenter that takes one frame at a time gets no batches: its first frame would only wait for the last.
+        """
+        if not isinstance(segmenter, BatchSegmenter):
+            segmenter_batches = None
+        return cls(
+            detector,
+            segmenter,
+            BatchingRunner("detector", partial(detect_batch, detector), detector_batches),
+            BatchingRunner("segmenter", partial(segment_batch, segmenter), segmenter_batches),
+            side_by_side=side_by_side,
+        )
+
+    def close(self) -> None:
+        """Ends the models' threads after what they are doing."""
+        self._detector_runner.close()
+        self._segmenter_runner.close()
+
+    async def perceive(self, request: PerceptionRequest, stream: str = "") -> Perception:
         """Runs both models on one picture.
 
         Args:
-            image: uint8 [H, W, 3] BGR, outside the region what the treatment shows there.
-            roi: bool [H, W]; None = the whole frame.
-            prompt: sentence for the segmenter; empty = `DEFAULT_PROMPT`.
-            min_score: detections below are dropped.
-            sequence: the camera's frame number.
+            request: the picture.
             stream: the camera's session.
         """
-        detected = await self._detector_runner.infer(lambda: _detect(self.detector, image, roi))
-        asked_for = detected.value.scores >= min_score
-        detections = detected.value.select(asked_for)
-        context = FrameContext(sequence, detections, stream, detected.value.select(~asked_for))
-        segmented = await self._segmenter_runner.infer(
-            lambda: _inside(self.segmenter, image, roi, prompt or DEFAULT_PROMPT, context)
-        )
-        stages = (
-            StageRun.of("detect", detected),
-            StageRun.of("segment", segmented),
-            *StageRun.parts("segment", segmented),
-        )
-        return Perception(detections, segmented.value, stages)
+        perception = await self.perceive_newest(lambda: request, stream)
+        assert perception is not None  # noqa: S101 - there was a request to take
+        return perception
+
+    async def perceive_newest(self, take: TakeRequest, stream: str = "") -> Perception | None:
+        """Runs both models on the picture that ``take`` gives when the first of them has a place for it.
+
+        Returns None where it gave none.
+        """
+        if self._side_by_side:
+            return await self._detect_beside_segment(take, stream)
+        return await self._detect_then_segment(take, stream)
+
+    async def _detect_then_segment(self, take: TakeRequest, stream: str) -> Perception | None:
+        claim = _Claim(take)
+        detected = await self._detector_runner.infer(claim.detection)
+        request = claim.request
+        if detected is None or request is None:
+            return None
+        detections, doubtful = _by_score(detected.value, request.min_score)
+        context = FrameContext(request.sequence, detections, stream, doubtful)
+        segmented = await self._segmenter_runner.infer(lambda: _segmentation_request(request, context))
+        return None if segmented is None else _perception(detections, detected, segmented)
+
+    async def _detect_beside_segment(self, take: TakeRequest, stream: str) -> Perception | None:
+        claim = _Claim(take)
+        detection = asyncio.ensure_future(self._detector_runner.infer(claim.detection))
+        segmentation = asyncio.ensure_future(self._segmenter_runner.infer(lambda: claim.segmentation(stream)))
+        try:
+            detected, segmented = await asyncio.gather(detection, segmentation)
+        finally:
+            detection.cancel()
+            segmentation.cancel()
+        request = claim.request
+        if detected is None or segmented is None or request is None:
+            return None
+        return _perception(_by_score(detected.value, request.min_score)[0], detected, segmented)
 
     def forget_stream(self, stream: str) -> None:
         """Lets the segmenter drop what it keeps of an ended session, once it has answered that session's frames.
@@ -106,35 +187,54 @@ class PerceptionModels:
 
     async def _forget(self, forget: Callable[[str], None], stream: str) -> None:
         try:
-            await self._segmenter_runner.infer(lambda: forget(stream))
+            await self._segmenter_runner.call(lambda: forget(stream))
         except Exception:
             log.exception("segmenter %s did not forget session %s", self.segmenter.name, stream)
 
 
-def _detect(detector: Detector, image: Image, roi: BoolMask | None) -> Detections:
-    """Boxes of a picture; a detector that can look at a region closely is told which."""
-    if roi is not None and isinstance(detector, RegionDetector):
-        return detector.detect_regions([image], [roi])[0]
-    return detector.detect([image])[0]
+class _Claim:
+    """Takes a request once, for both models: the frame is settled when the first of them begins."""
+
+    def __init__(self, take: TakeRequest) -> None:
+        self._take: TakeRequest | None = take
+        self.request: PerceptionRequest | None = None
+
+    def settle(self) -> PerceptionRequest | None:
+        take, self._take = self._take, None
+        if take is not None:
+            self.request = take()
+        return self.request
+
+    def detection(self) -> DetectionRequest | None:
+        request = self.settle()
+        return None if request is None else DetectionRequest(request.image, request.roi)
+
+    def segmentation(self, stream: str) -> SegmentationRequest | None:
+        request = self.settle()
+        if request is None:
+            return None
+        return _segmentation_request(request, FrameContext(request.sequence, Detections.empty(), stream))
 
 
-def _inside(
-    segmenter: Segmenter, image: Image, roi: BoolMask | None, prompt: str, context: FrameContext
-) -> Segmentation:
-    """M_k = F(I~_k, p) intersected with R_k; outside it nothing is known, so there is no uncertainty either.
+def _by_score(found: Detections, min_score: float) -> tuple[Detections, Detections]:
+    """What is asked for, and what is too doubtful."""
+    asked_for = found.scores >= min_score
+    return found.select(asked_for), found.select(~asked_for)
 
-    Raises:
-        ModelError: if the segmenter's uncertainty is not uint8 of the picture's size.
-    """
-    whole = np.ones(image.shape[:2], np.bool_) if roi is None else roi
-    segmentation = segmenter.segment(image, whole, prompt, context)
-    uncertainty = segmentation.uncertainty
-    if uncertainty is not None and (uncertainty.shape != image.shape[:2] or uncertainty.dtype != np.uint8):
-        raise ModelError(
-            f"segmenter {segmenter.name} must state its uncertainty as uint8 {list(image.shape[:2])}, got "
-            f"{uncertainty.dtype} {list(uncertainty.shape)}"
-        )
+
+def _segmentation_request(request: PerceptionRequest, context: FrameContext) -> SegmentationRequest:
+    roi = request.roi
     if roi is None:
-        return segmentation
-    known = None if uncertainty is None else np.where(roi, uncertainty, np.uint8(0))
-    return replace(segmentation, mask=segmentation.mask & roi, uncertainty=known)
+        roi = np.ones(request.image.shape[:2], np.bool_)
+    return SegmentationRequest(request.image, roi, request.prompt or DEFAULT_PROMPT, context)
+
+
+def _perception(
+    detections: Detections, detected: ModelRun[Detections], segmented: ModelRun[Segmentation]
+) -> Perception:
+    stages = (
+        StageRun.of("detect", detected),
+        StageRun.of("segment", segmented),
+        *StageRun.parts("segment", segmented),
+    )
+    return Perception(detections, segmented.value, stages)

@@ -69,6 +69,7 @@ class CropSegmenter:
         self.name = f"crop:{inner.name}"
         self.revision = inner.revision
         self.device = inner.device
+        self.uses_detections = bool(getattr(inner, "uses_detections", True))
 
     def segment(self, image: Image, roi: BoolMask, prompt: str, context: FrameContext) -> Segmentation:
         """See `Segmenter`.

@@ -24,7 +24,8 @@ from cable_rpc.cloud.authentication import AuthenticationInterceptor, Authentica
 from cable_rpc.cloud.limits import ServerLimits
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.request_bounds import RequestBounds
-from cable_rpc.cloud.session import PerceptionSession, SessionLimits, model_infos
+from cable_rpc.cloud.session import PerceptionSession, model_infos
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
 from cable_rpc.cloud.tokens import AccessFile
 from cable_rpc.errors import ConfigurationError, Refusal

@@ -11,61 +11,28 @@ import time
 import uuid
 from collections.abc import AsyncGenerator, AsyncIterator
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from typing import Any
 
 from google.rpc import code_pb2, status_pb2
 
 from cable_rpc.cloud.admission import AdmissionControl, StreamShare
+from cable_rpc.cloud.answer_queue import Answer, AnswerQueue, Response
 from cable_rpc.cloud.bounds import check_codec_config, check_hello, check_task
+from cable_rpc.cloud.frame_answers import rejection_of, resolve, result_of
 from cable_rpc.cloud.limits import ANYBODY, Identity
-from cable_rpc.cloud.perception import Perception, PerceptionModels
+from cable_rpc.cloud.newest_frame import NewestFrame, WaitingFrame
+from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.public_text import log_text, public_text
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
 from cable_rpc.cloud.throttled_log import ThrottledWarning
 from cable_rpc.errors import CableError, ProtocolError, Refusal
-from cable_rpc.wire.convert import (
-    PROTOCOL_REVISION,
-    detections_to_messages,
-    mask_to_message,
-    status_of,
-)
+from cable_rpc.wire.convert import PROTOCOL_REVISION, status_of
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
 log = logging.getLogger(__name__)
 warn_of_refusal = ThrottledWarning(log)
 
-Response = pb.StreamPerceptionResponse
-
-
-@dataclass(frozen=True, slots=True)
-class SessionLimits:
-    """What one session may use."""
-
-    max_in_flight: int = 2
-    """Unanswered frames; 2 keeps a link busy without queueing stale video."""
-    max_frame_bytes: int = 2 << 20
-    max_pixels: int = 4096 * 2304
-    default_min_score: float = 0.4
-    hello_timeout_s: float = 10.0
-    heartbeat_s: float = 5.0
-    close_timeout_s: float = 5.0
-    idle_timeout_s: float = 300.0
-    """A client that has nothing unanswered and sends nothing for so long is sent away."""
-
-    def flow(self) -> pb.FlowUpdate:
-        """The limits as the client is told them."""
-        return pb.FlowUpdate(max_in_flight=self.max_in_flight, max_frame_bytes=self.max_frame_bytes)
-
-
-@dataclass(frozen=True, slots=True)
-class _Accepted:
-    """A decoded frame that waits for the models."""
-
-    message: pb.VideoFrame
-    decoded: DecodedFrame
-    timing: pb.ServerTiming
-    answer: asyncio.Future[Response]
+Requests = AsyncIterator[pb.StreamPerceptionRequest]
 
 
 def model_infos(models: PerceptionModels) -> list[pb.ModelInfo]:
@@ -104,20 +71,17 @@ class PerceptionSession:
         self._admission = admission or AdmissionControl()
         self.identity = identity
         self._share: StreamShare | None = None
-        self._outbound: asyncio.Queue[Response | asyncio.Future[Response] | None] = asyncio.Queue()
-        self._newest: _Accepted | None = None
-        self._newest_arrived = asyncio.Event()
+        self._answers = AnswerQueue()
+        self._newest = NewestFrame(limits.latency_bound_s)
         self._decoder: StreamDecoder | None = None
         self._codec: pb.Codec = pb.CODEC_UNSPECIFIED
         self._task = pb.TaskConfig()
-        self._in_flight = 0
         self._last_sequence: int | None = None
         self._keyframe_requested = False
         self._closing = False
         self._heard_s = time.monotonic()
-        self._awaited: asyncio.Future[Any] | None = None
 
-    async def run(self, requests: AsyncIterator[pb.StreamPerceptionRequest]) -> AsyncGenerator[Response, None]:
+    async def run(self, requests: Requests) -> AsyncGenerator[Response, None]:
         """Serves the stream until the client ends it, breaks a rule, or `drain` is called."""
         reader = asyncio.create_task(self._read_all(requests))
         inference = asyncio.create_task(self._infer_newest())
@@ -125,9 +89,8 @@ class PerceptionSession:
             while (response := await self._next_response()) is not None:
                 yield response
         finally:
-            for task in (reader, inference, self._awaited):
-                if task is not None:
-                    task.cancel()
+            reader.cancel()
+            inference.cancel()
             await asyncio.gather(reader, inference, return_exceptions=True)
             if self._share is not None:
                 self._share.release()
@@ -149,32 +112,25 @@ class PerceptionSession:
             self._heard_s = time.monotonic()
             status.message = public_text(status.message)
             closing = pb.Closing(status=status, action=action, alternative_target=alternative_target)
-            self._send(Response(closing=closing))
+            self._answers.send(Response(closing=closing))
 
     # -- outbound ---------------------------------------------------------------------------------------------
 
     async def _next_response(self) -> Response | None:
         """The next message in order, a heartbeat if nothing is ready in time, None at the end."""
         while True:
-            if self._awaited is None:
-                self._awaited = asyncio.ensure_future(self._outbound.get())
-            done, _ = await asyncio.wait({self._awaited}, timeout=self._limits.heartbeat_s)
-            if not done:
+            try:
+                return await self._answers.next(self._limits.heartbeat_s)
+            except TimeoutError:
                 if self._is_overdue():
                     return None
                 if not self._closing:
                     return Response(flow_update=self._flow())
-                continue
-            item, self._awaited = self._awaited.result(), None
-            if not isinstance(item, asyncio.Future):
-                return item
-            item.add_done_callback(self._release_credit)
-            self._awaited = item
 
     def _is_overdue(self) -> bool:
         """True when a client that was sent away has not gone; sends away one that has long been silent."""
         silent_s = time.monotonic() - self._heard_s
-        if self._in_flight:
+        if self._answers.unanswered:
             return False
         if self._closing:
             return silent_s > self._limits.close_timeout_s
@@ -191,15 +147,9 @@ class PerceptionSession:
             flow.max_frame_rate = self._share.frame_rate_advice
         return flow
 
-    def _release_credit(self, _: asyncio.Future[Response]) -> None:
-        self._in_flight -= 1
-
-    def _send(self, response: Response) -> None:
-        self._outbound.put_nowait(response)
-
     # -- inbound ----------------------------------------------------------------------------------------------
 
-    async def _read_all(self, requests: AsyncIterator[pb.StreamPerceptionRequest]) -> None:
+    async def _read_all(self, requests: Requests) -> None:
         try:
             self._share = self._admission.open_stream(self.identity)
             await self._read_hello(requests)
@@ -221,11 +171,11 @@ class PerceptionSession:
             internal = status_pb2.Status(code=code_pb2.INTERNAL, message="internal error; see the server's log")
             await self._close(requests, internal, pb.CLOSE_ACTION_STOP)
         finally:
-            self._outbound.put_nowait(None)
+            self._answers.end()
 
     async def _close(
         self,
-        requests: AsyncIterator[pb.StreamPerceptionRequest],
+        requests: Requests,
         status: status_pb2.Status,
         action: pb.CloseAction,
     ) -> None:
@@ -238,7 +188,7 @@ class PerceptionSession:
         except TimeoutError:
             log.info("session %s: the client did not half-close", self.session_id)
 
-    async def _read_hello(self, requests: AsyncIterator[pb.StreamPerceptionRequest]) -> None:
+    async def _read_hello(self, requests: Requests) -> None:
         try:
             async with asyncio.timeout(self._limits.hello_timeout_s):
                 first = await anext(requests, None)
@@ -268,16 +218,13 @@ class PerceptionSession:
             hello.codec_config.width,
             hello.codec_config.height,
         )
-        self._send(
-            Response(
-                welcome=pb.Welcome(
-                    protocol_revision=PROTOCOL_REVISION,
-                    session_id=self.session_id,
-                    flow=self._flow(),
-                    models=model_infos(self._models),
-                )
-            )
+        welcome = pb.Welcome(
+            protocol_revision=PROTOCOL_REVISION,
+            session_id=self.session_id,
+            flow=self._flow(),
+            models=model_infos(self._models),
         )
+        self._answers.send(Response(welcome=welcome))
 
     def _configure(self, config: pb.CodecConfig) -> None:
         check_codec_config(config, self._limits.max_pixels)
@@ -303,7 +250,7 @@ class PerceptionSession:
 
     async def _accept(self, frame: pb.VideoFrame) -> None:
         received_ns = time.monotonic_ns()
-        if self._in_flight >= self._limits.max_in_flight:
+        if self._answers.unanswered >= self._limits.max_in_flight:
             raise ProtocolError(
                 f"frame {frame.sequence} exceeds the credit of {self._limits.max_in_flight} unanswered frames"
             )
@@ -311,9 +258,7 @@ class PerceptionSession:
             raise ProtocolError(f"sequence must rise: {frame.sequence} came after {self._last_sequence}")
         wait_s = self._share.take_frame(len(frame.data)) if self._share is not None else 0.0
         self._last_sequence = frame.sequence
-        self._in_flight += 1
-        answer: asyncio.Future[Response] = asyncio.get_running_loop().create_future()
-        self._outbound.put_nowait(answer)
+        answer = self._answers.open_answer()
         timing = pb.ServerTiming(receive_time_ns=received_ns)
         if wait_s:
             # Not reading on is what slows the client down: its credit is bounded.
@@ -321,8 +266,7 @@ class PerceptionSession:
         try:
             decoded = await self._decode(frame, timing)
         except FrameRejection as rejection:
-            _reject(answer, frame, timing, rejection)
-            self._request_keyframe()
+            self._reject(answer, frame, timing, rejection)
             return
         except Exception:
             # An answer left open would hold back all later ones.
@@ -330,11 +274,14 @@ class PerceptionSession:
             if self._decoder is not None:
                 self._decoder.mark_lost()
             message = f"frame {frame.sequence} can't be decoded; see the server's log"
-            _reject(answer, frame, timing, FrameRejection(pb.REJECT_REASON_UNDECODABLE, message))
-            self._request_keyframe()
+            self._reject(answer, frame, timing, FrameRejection(pb.REJECT_REASON_UNDECODABLE, message))
             return
         self._keyframe_requested = False
-        self._offer(_Accepted(frame, decoded, timing, answer))
+        self._newest.offer(WaitingFrame(frame.sequence, decoded, timing, answer, frame.deadline_ns))
+
+    def _reject(self, answer: Answer, frame: pb.VideoFrame, timing: pb.ServerTiming, rejection: FrameRejection) -> None:
+        resolve(answer, rejection_of(frame.sequence, timing, rejection.reason, str(rejection)))
+        self._request_keyframe()
 
     async def _decode(self, frame: pb.VideoFrame, timing: pb.ServerTiming) -> DecodedFrame:
         decoder = self._decoder
@@ -365,101 +312,42 @@ class PerceptionSession:
             return
         if decoder.needs_keyframe:
             self._keyframe_requested = True
-            self._send(Response(keyframe_request=pb.KeyframeRequest(last_good_sequence=decoder.last_good_sequence)))
-
-    def _offer(self, accepted: _Accepted) -> None:
-        overtaken = self._newest
-        self._newest = accepted
-        self._newest_arrived.set()
-        if overtaken is not None:
-            _reject(
-                overtaken.answer,
-                overtaken.message,
-                overtaken.timing,
-                FrameRejection(
-                    pb.REJECT_REASON_SUPERSEDED,
-                    f"frame {overtaken.message.sequence} was overtaken by {accepted.message.sequence}",
-                ),
+            self._answers.send(
+                Response(keyframe_request=pb.KeyframeRequest(last_good_sequence=decoder.last_good_sequence))
             )
 
     # -- inference --------------------------------------------------------------------------------------------
 
     async def _infer_newest(self) -> None:
         while True:
-            await self._newest_arrived.wait()
-            self._newest_arrived.clear()
-            accepted, self._newest = self._newest, None
-            if accepted is not None:
-                await self._answer(accepted)
+            await self._newest.wait()
+            await self._perceive_newest()
 
-    async def _answer(self, accepted: _Accepted) -> None:
-        frame, timing = accepted.message, accepted.timing
-        waited_ns = time.monotonic_ns() - timing.receive_time_ns
-        if 0 < frame.deadline_ns < waited_ns:
-            _reject(
-                accepted.answer,
-                frame,
-                timing,
-                FrameRejection(
-                    pb.REJECT_REASON_DEADLINE,
-                    f"frame {frame.sequence} waited {waited_ns / 1e6:.0f} ms, its deadline is "
-                    f"{frame.deadline_ns / 1e6:.0f} ms",
-                ),
+    async def _perceive_newest(self) -> None:
+        taken: list[WaitingFrame] = []
+
+        def take() -> PerceptionRequest | None:
+            frame = self._newest.take()
+            if frame is None:
+                return None
+            taken.append(frame)
+            min_score = self._task.min_score or self._limits.default_min_score
+            return PerceptionRequest(
+                frame.decoded.image, frame.decoded.roi, min_score, self._task.prompt, frame.sequence
             )
-            return
+
         try:
-            perception = await self._models.perceive(
-                accepted.decoded.image,
-                accepted.decoded.roi,
-                prompt=self._task.prompt,
-                min_score=self._task.min_score or self._limits.default_min_score,
-                sequence=frame.sequence,
-                stream=self.session_id,
-            )
+            perception = await self._models.perceive_newest(take, self.session_id)
         except asyncio.CancelledError:
             raise
         except Exception as error:
-            log.exception("session %s: a model failed on frame %d", self.session_id, frame.sequence)
+            log.exception("session %s: a model failed", self.session_id)
             shown = str(error) if isinstance(error, CableError) else "a model failed; see the server's log"
-            _reject(
-                accepted.answer,
-                frame,
-                timing,
-                FrameRejection(pb.REJECT_REASON_MODEL_FAILED, f"frame {frame.sequence}: {shown}"),
-            )
+            for frame in taken:
+                text = f"frame {frame.sequence}: {shown}"
+                rejection = rejection_of(frame.sequence, frame.timing, pb.REJECT_REASON_MODEL_FAILED, text)
+                resolve(frame.answer, rejection)
             return
-        _resolve(accepted.answer, Response(result=_result(frame.sequence, timing, perception)))
-
-
-def _result(sequence: int, timing: pb.ServerTiming, perception: Perception) -> pb.Result:
-    timing.stages.extend(
-        pb.StageTiming(stage=run.stage, wait_ns=run.wait_ns, run_ns=run.run_ns, batch_size=run.batch_size)
-        for run in perception.stages
-    )
-    result = pb.Result(
-        sequence=sequence,
-        timing=timing,
-        detections=detections_to_messages(perception.detections),
-        mask=mask_to_message(perception.segmentation),
-    )
-    result.timing.send_time_ns = time.monotonic_ns()
-    return result
-
-
-def _reject(
-    answer: asyncio.Future[Response], frame: pb.VideoFrame, timing: pb.ServerTiming, rejection: FrameRejection
-) -> None:
-    timing.send_time_ns = time.monotonic_ns()
-    _resolve(
-        answer,
-        Response(
-            frame_rejected=pb.FrameRejected(
-                sequence=frame.sequence, reason=rejection.reason, message=public_text(str(rejection)), timing=timing
-            )
-        ),
-    )
-
-
-def _resolve(answer: asyncio.Future[Response], response: Response) -> None:
-    if not answer.done():
-        answer.set_result(response)
+        if perception is not None:
+            (frame,) = taken
+            resolve(frame.answer, result_of(frame.sequence, frame.timing, perception))

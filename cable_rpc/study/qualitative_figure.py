@@ -18,8 +18,7 @@ import numpy as np
 from cable_codecs import CodecParameters
 
 from cable_rpc.cloud.backends import Detector, Segmenter
-from cable_rpc.cloud.model_runner import ThreadModelRunner
-from cable_rpc.cloud.perception import Perception, PerceptionModels
+from cable_rpc.cloud.perception import Perception, PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.stream_decoder import StreamDecoder
 from cable_rpc.data.source import FrameSource
 from cable_rpc.edge.capture import CapturedFrame
@@ -152,8 +151,7 @@ class RunningModels:
     """Detector and segmenter in threads of their own, asked from plain code; use as a context manager."""
 
     def __init__(self, detector: Detector, segmenter: Segmenter) -> None:
-        self._threads = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
-        self._models = PerceptionModels(detector, segmenter, *self._threads)
+        self._models = PerceptionModels.in_process(detector, segmenter)
         self._runner = asyncio.Runner()
 
     def __enter__(self) -> Self:
@@ -163,15 +161,14 @@ class RunningModels:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._runner.close()
-        for thread in self._threads:
-            thread.close()
+        self._models.close()
 
     def perceive(
         self, image: Image, roi: BoolMask | None, settings: FigureSettings, sequence: int, stream: str
     ) -> Perception:
         """Boxes and mask of a picture, as a server answers it."""
         asked = self._models.perceive(
-            image, roi, prompt=settings.prompt, min_score=settings.min_score, sequence=sequence, stream=stream
+            PerceptionRequest(image, roi, settings.min_score, settings.prompt, sequence), stream
         )
         return self._runner.run(asked)
 

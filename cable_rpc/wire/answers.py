@@ -29,7 +29,7 @@ class ServerTimes:
             timing.receive_time_ns,
             timing.send_time_ns,
             timing.decode_ns,
-            timing.decode_wait_ns + sum(stage.wait_ns for stage in timing.stages),
+            timing.decode_wait_ns + _model_wait_ns(timing),
             {stage.stage: stage.run_ns for stage in timing.stages},
         )
 
@@ -97,3 +97,15 @@ class FrameAnswer:
             b"",
             rejection=f"{reason}: {rejected.message}",
         )
+
+
+def _model_wait_ns(timing: pb.ServerTiming) -> int:
+    """Waiting for the models; while one of them runs, a frame does not wait for another."""
+    stages = sorted((stage for stage in timing.stages if stage.start_time_ns), key=lambda stage: stage.start_time_ns)
+    if not stages:
+        return sum(stage.wait_ns for stage in timing.stages)
+    waited_ns, busy_until_ns = 0, stages[0].start_time_ns - stages[0].wait_ns
+    for stage in stages:
+        waited_ns += max(0, stage.start_time_ns - busy_until_ns)
+        busy_until_ns = max(busy_until_ns, stage.start_time_ns + stage.run_ns)
+    return waited_ns

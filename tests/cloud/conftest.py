@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from cable_rpc.cloud.backends import FrameContext
-from cable_rpc.cloud.model_runner import ThreadModelRunner
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.segmenters import BoxSegmenter
 from cable_rpc.cloud.service import PerceptionServer, ServerConfig
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
 from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
@@ -56,13 +55,11 @@ def running_server() -> ServerFactory:
     async def start(
         *, segmenter: Any = None, limits: SessionLimits | None = None, detector: Any = None
     ) -> AsyncIterator[str]:
-        runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
-        models = PerceptionModels(detector or BrightBoxDetector(), segmenter or BoxSegmenter(), *runners)
+        models = PerceptionModels.in_process(detector or BrightBoxDetector(), segmenter or BoxSegmenter())
         config = ServerConfig("127.0.0.1:0", limits or SessionLimits(close_timeout_s=1.0), drain_s=1.0)
         async with PerceptionServer(models, config) as server:
             yield f"127.0.0.1:{server.port}"
-        for runner in runners:
-            runner.close()
+        models.close()
 
     return start
 

@@ -8,11 +8,10 @@ from typing import Any
 
 from cable_codecs import CodecParameters, create_encoder
 
-from cable_rpc.cloud.model_runner import ThreadModelRunner
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.segmenters import BoxSegmenter
 from cable_rpc.cloud.service import PerceptionServer, ServerConfig
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.wire.answers import FrameAnswer
 from cable_rpc.wire.v1 import perception_pb2 as pb
@@ -26,13 +25,11 @@ LIMITS = SessionLimits(close_timeout_s=1.0)
 @asynccontextmanager
 async def serving(*, detector: Any = None, segmenter: Any = None, **settings: Any) -> AsyncIterator[PerceptionServer]:
     """A listening server; ``settings`` are fields of ServerConfig."""
-    runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
-    models = PerceptionModels(detector or BrightBoxDetector(), segmenter or BoxSegmenter(), *runners)
+    models = PerceptionModels.in_process(detector or BrightBoxDetector(), segmenter or BoxSegmenter())
     fields = {"address": "127.0.0.1:0", "limits": LIMITS, "drain_s": 1.0} | settings
     async with PerceptionServer(models, ServerConfig(**fields)) as server:
         yield server
-    for runner in runners:
-        runner.close()
+    models.close()
 
 
 def client(target: str, frame_rate: float = 10.0, **settings: Any) -> PerceptionClient:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from cable_rpc.cloud.admission import BURST_S, LONGEST_WAIT_S, AdmissionControl, TokenBucket
 from cable_rpc.cloud.limits import Identity, IdentityLimits, ServerLimits
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.edge.channel import ClientSecurity
 from cable_rpc.errors import CapacityError, ProtocolError, Refusal, RemoteError
 from cable_rpc.wire.convert import retry_after_s

@@ -13,8 +13,7 @@ from cable_models import embedded_detector_path
 from cable_rpc.cloud import detectors
 from cable_rpc.cloud.backends import BackendOptions, RegionDetector
 from cable_rpc.cloud.detectors import load_embedded, load_onnx, load_rtdetr
-from cable_rpc.cloud.model_runner import ThreadModelRunner
-from cable_rpc.cloud.perception import PerceptionModels
+from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.segmenters import BoxSegmenter
 from cable_rpc.errors import ConfigurationError, ModelError
 
@@ -115,9 +114,8 @@ async def test_a_session_s_region_reaches_the_detector() -> None:
     region = np.zeros(frame.shape[:2], np.bool_)
     region[250:400, 300:600] = True
     cropped = load_embedded("?crop=roi", LOW)
-    runner = ThreadModelRunner("test")
-    models = PerceptionModels(cropped, BoxSegmenter(), runner, runner)
-    seen = await models.perceive(frame, region, prompt="", min_score=0.0, sequence=0)
-    runner.close()
+    models = PerceptionModels.in_process(cropped, BoxSegmenter())
+    seen = await models.perceive(PerceptionRequest(frame, region, min_score=0.0))
+    models.close()
     np.testing.assert_array_equal(seen.detections.boxes_xyxy, cropped.detect_regions([frame], [region])[0].boxes_xyxy)
     assert not np.array_equal(seen.detections.boxes_xyxy, cropped.detect([frame])[0].boxes_xyxy)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from cable_codecs import STILL_CODECS, CodecParameters, RegionTreatment, TreatedDecoder, available_codecs
 
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.edge.capture import Capture
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder

@@ -11,7 +11,7 @@ import pytest
 from cable_codecs import CodecParameters, EncodedFrame, available_codecs, create_encoder, encode_mask
 from google.rpc import code_pb2
 
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
 from .conftest import BrightBoxDetector, FailingSegmenter

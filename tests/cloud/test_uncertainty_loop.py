@@ -13,7 +13,7 @@ from cable_codecs import CodecParameters
 
 from cable_rpc.cloud.backends import FrameContext
 from cable_rpc.cloud.segmenters import BoxSegmenter
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.edge.capture import Capture
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder

@@ -24,11 +24,10 @@ from cable_codecs import CodecParameters, create_encoder
 from cable_models import embedded_detector_path
 
 from cable_rpc.cloud.backends import FrameContext
-from cable_rpc.cloud.model_runner import ThreadModelRunner
-from cable_rpc.cloud.perception import PerceptionModels
+from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.segmenters import BoxSegmenter
 from cable_rpc.cloud.service import PerceptionServer, ServerConfig
-from cable_rpc.cloud.session import SessionLimits
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.data.source import open_source
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.errors import ConfigurationError, ModelError
@@ -80,8 +79,7 @@ class WholeFrameSegmenter(BoxSegmenter):
 
 def cheap_models(choice: ModelChoice, segmenter: BoxSegmenter | None = None) -> LoadedModels:
     keeper = ScoreKeeper(TileDetector())
-    runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
-    return LoadedModels(PerceptionModels(keeper, segmenter or BoxSegmenter(), *runners), keeper)
+    return LoadedModels(PerceptionModels.in_process(keeper, segmenter or BoxSegmenter()), keeper)
 
 
 cheap_run = partial(run_sequence, load=cheap_models)
@@ -173,7 +171,7 @@ def test_the_reference_stays_h264_where_regions_are_jpeg() -> None:
 async def test_weak_detections_reach_average_precision_and_are_not_answered() -> None:
     models = cheap_models(SETTINGS.models)
     image = next(iter(open_source("synthetic:11", max_frames=1, size=(160, 96)))).image
-    answer = await models.perception.perceive(image, None, prompt="", min_score=0.4, sequence=0)
+    answer = await models.perception.perceive(PerceptionRequest(image, None, min_score=0.4))
     kept = models.keeper.newest
     assert 0 < len(answer.detections) < len(kept)
     assert answer.detections.scores.min() >= 0.4 > kept.scores.min()

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segmenter
-from cable_rpc.cloud.model_runner import ThreadModelRunner
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.closed_loop.score_keeper import WEAKEST_SCORE, ScoreKeeper
@@ -56,5 +55,4 @@ def load_models(choice: ModelChoice) -> LoadedModels:
         segmenter = load_segmenter(choice.segmenter, options)
     except ModuleNotFoundError as error:
         raise ConfigurationError(f"{error.name} is missing: pip install 'cable-rpc[cloud,study]'") from error
-    runners = ThreadModelRunner("detector"), ThreadModelRunner("segmenter")
-    return LoadedModels(PerceptionModels(keeper, segmenter, *runners), keeper)
+    return LoadedModels(PerceptionModels.in_process(keeper, segmenter, side_by_side=False), keeper)

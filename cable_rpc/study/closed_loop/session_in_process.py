@@ -8,7 +8,8 @@ from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 
 from cable_rpc.cloud.perception import PerceptionModels
-from cable_rpc.cloud.session import PerceptionSession, SessionLimits
+from cable_rpc.cloud.session import PerceptionSession
+from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.edge.client import SessionRequest
 from cable_rpc.errors import FrameError, RemoteError
 from cable_rpc.wire.answers import FrameAnswer
@@ -97,6 +98,8 @@ def nominal_size(response: pb.StreamPerceptionResponse) -> int:
     timing.decode_wait_ns = timing.decode_ns = NOMINAL_DURATION_NS
     for stage in timing.stages:
         stage.wait_ns = stage.run_ns = NOMINAL_DURATION_NS
+        if stage.start_time_ns:
+            stage.start_time_ns = NOMINAL_STAMP_NS
     if copy.result.mask.HasField("prefill"):
         copy.result.mask.prefill.measured_ns = copy.result.mask.prefill.whole_ns = NOMINAL_DURATION_NS
     return copy.ByteSize()

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from cable_rpc.cloud.perception import PerceptionRequest
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.closed_loop.measured_frame import Reference
 from cable_rpc.study.closed_loop.models import LoadedModels, ModelLoader, load_models
@@ -113,7 +114,7 @@ async def whole_frame_results(clip: StoredClip, models: LoadedModels, prompt: st
     found = []
     for frame in clip:
         answer = await models.perception.perceive(
-            frame.image, None, prompt=prompt, min_score=OPERATING_SCORE, sequence=frame.index, stream="reference"
+            PerceptionRequest(frame.image, None, OPERATING_SCORE, prompt, frame.index), "reference"
         )
         found.append(Reference(models.keeper.newest, answer.segmentation.mask))
     models.perception.forget_stream("reference")

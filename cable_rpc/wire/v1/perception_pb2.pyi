@@ -350,16 +350,18 @@ class ServerTiming(_message.Message):
     def __init__(self, receive_time_ns: _Optional[int] = ..., send_time_ns: _Optional[int] = ..., decode_wait_ns: _Optional[int] = ..., decode_ns: _Optional[int] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ...) -> None: ...
 
 class StageTiming(_message.Message):
-    __slots__ = ("stage", "wait_ns", "run_ns", "batch_size")
+    __slots__ = ("stage", "wait_ns", "run_ns", "batch_size", "start_time_ns")
     STAGE_FIELD_NUMBER: _ClassVar[int]
     WAIT_NS_FIELD_NUMBER: _ClassVar[int]
     RUN_NS_FIELD_NUMBER: _ClassVar[int]
     BATCH_SIZE_FIELD_NUMBER: _ClassVar[int]
+    START_TIME_NS_FIELD_NUMBER: _ClassVar[int]
     stage: str
     wait_ns: int
     run_ns: int
     batch_size: int
-    def __init__(self, stage: _Optional[str] = ..., wait_ns: _Optional[int] = ..., run_ns: _Optional[int] = ..., batch_size: _Optional[int] = ...) -> None: ...
+    start_time_ns: int
+    def __init__(self, stage: _Optional[str] = ..., wait_ns: _Optional[int] = ..., run_ns: _Optional[int] = ..., batch_size: _Optional[int] = ..., start_time_ns: _Optional[int] = ...) -> None: ...
 
 class Detection(_message.Message):
     __slots__ = ("x_min", "y_min", "x_max", "y_max", "class_id", "score")
