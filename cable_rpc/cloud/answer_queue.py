@@ -18,7 +18,7 @@ class AnswerQueue:
         self._places: deque[Response | Answer | None] = deque()
         self._ready = asyncio.Event()
         self.unanswered = 0
-        """Places of frames that no answer has filled."""
+        """Frames whose answer has not been handed out; one that is ready counts until the client can take it."""
 
     def send(self, response: Response) -> None:
         """A message that is ready."""
@@ -28,7 +28,7 @@ class AnswerQueue:
     def open_answer(self) -> Answer:
         """Takes the place of a frame's answer, which the caller sets; later messages wait for it."""
         answer: Answer = asyncio.get_running_loop().create_future()
-        answer.add_done_callback(self._answered)
+        answer.add_done_callback(self._wake)
         self._places.append(answer)
         self.unanswered += 1
         return answer
@@ -49,7 +49,10 @@ class AnswerQueue:
             async with asyncio.timeout(timeout_s):
                 await self._ready.wait()
         place = self._places.popleft()
-        return place.result() if isinstance(place, asyncio.Future) else place
+        if not isinstance(place, asyncio.Future):
+            return place
+        self.unanswered -= 1
+        return place.result()
 
     def _has_next(self) -> bool:
         if not self._places:
@@ -57,10 +60,6 @@ class AnswerQueue:
         first = self._places[0]
         return not isinstance(first, asyncio.Future) or first.done()
 
-    def _answered(self, _: Answer) -> None:
-        self.unanswered -= 1
-        self._wake()
-
-    def _wake(self) -> None:
+    def _wake(self, _: Answer | None = None) -> None:
         if self._has_next():
             self._ready.set()

@@ -7,20 +7,18 @@ place holds no picture: its frame is asked for when the batch is put together, a
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
 from cable_rpc.cloud.model_runner import ModelRun
 from cable_rpc.errors import ConfigurationError
-
-log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
@@ -84,17 +82,24 @@ class BatchingRunner(Generic[Item, Answer]):
         self._run_batch = run_batch
         self._executor = ThreadPoolExecutor(self.policy.workers, thread_name_prefix=name)
         self._queue: deque[_Place[Item, Answer]] = deque()
-        self._running: set[Future[_Outcome[Answer]]] = set()
+        self._running: dict[Future[_Outcome[Answer]], int] = {}
         self._alarm: asyncio.TimerHandle | None = None
         self._alarm_loop: asyncio.AbstractEventLoop | None = None
+        self._loop: asyncio.AbstractEventLoop
         self._item_run_s = 0.0
 
     async def infer(self, take: Callable[[], Item | None]) -> ModelRun[Answer] | None:
         """See `ModelRunner`."""
-        answer: asyncio.Future[ModelRun[Answer] | None] = asyncio.get_running_loop().create_future()
+        self._loop = asyncio.get_running_loop()
+        answer: asyncio.Future[ModelRun[Answer] | None] = self._loop.create_future()
         self._queue.append(_Place(take, answer, time.monotonic_ns()))
         self._schedule()
         return await answer
+
+    def backlog_s(self) -> float:
+        """See `ModelRunner`."""
+        frames = len(self._queue) + sum(self._running.values()) + 1
+        return frames * self._item_run_s / self.policy.workers
 
     async def call(self, function: Callable[[], T]) -> T:
         """See `ModelRunner`."""
@@ -112,7 +117,7 @@ class BatchingRunner(Generic[Item, Answer]):
             first = self._queue[0]
             due_ns = first.queued_ns + round(self.policy.wait_s * 1e9) - time.monotonic_ns()
             if due_ns > 0 and len(self._queue) < self.policy.max_batch and not first.answer.done():
-                self._set_alarm(first.answer.get_loop(), due_ns / 1e9)
+                self._set_alarm(due_ns / 1e9)
                 return
             share = -(-len(self._queue) // free)
             self._begin(min(share, self._largest_batch()))
@@ -122,10 +127,10 @@ class BatchingRunner(Generic[Item, Answer]):
             return self.policy.max_batch
         return min(self.policy.max_batch, max(1, int(self.policy.max_run_s / self._item_run_s)))
 
-    def _set_alarm(self, loop: asyncio.AbstractEventLoop, delay_s: float) -> None:
+    def _set_alarm(self, delay_s: float) -> None:
         # An alarm of a loop that has ended never rings.
-        if self._alarm is None or self._alarm_loop is not loop:
-            self._alarm, self._alarm_loop = loop.call_later(delay_s, self._alarmed), loop
+        if self._alarm is None or self._alarm_loop is not self._loop:
+            self._alarm, self._alarm_loop = self._loop.call_later(delay_s, self._alarmed), self._loop
 
     def _alarmed(self) -> None:
         self._alarm = None
@@ -133,7 +138,7 @@ class BatchingRunner(Generic[Item, Answer]):
 
     def _free_workers(self) -> int:
         # A batch whose event loop is gone reports to nobody, so its end is looked at here.
-        self._running = {batch for batch in self._running if not batch.done()}
+        self._running = {batch: size for batch, size in self._running.items() if not batch.done()}
         return self.policy.workers - len(self._running)
 
     def _begin(self, size: int) -> None:
@@ -155,7 +160,7 @@ class BatchingRunner(Generic[Item, Answer]):
                 items.append(item)
         if items:
             batch = self._executor.submit(self._run, items)
-            self._running.add(batch)
+            self._running[batch] = len(items)
             batch.add_done_callback(partial(self._report, places))
 
     def _report(self, places: list[_Place[Item, Answer]], batch: Future[_Outcome[Answer]]) -> None:
@@ -164,7 +169,9 @@ class BatchingRunner(Generic[Item, Answer]):
             if not batch.cancelled():
                 places[0].answer.get_loop().call_soon_threadsafe(self._finish, places, batch.result())
         except RuntimeError:
-            log.debug("the event loop has ended before its batch of %d", len(places))
+            # The loop has ended; what waits belongs to the next one, if there is one already.
+            with suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._schedule)
 
     def _run(self, items: list[Item]) -> _Outcome[Answer]:
         started_ns = time.monotonic_ns()

@@ -36,6 +36,10 @@ class ModelRunner(Protocol[Item, Answer]):
         """
         ...
 
+    def backlog_s(self) -> float:
+        """How long another frame is likely to be on its way through, as far as it is known."""
+        ...
+
     async def call(self, function: Callable[[], T]) -> T:
         """Runs something where the model runs, between its batches."""
         ...

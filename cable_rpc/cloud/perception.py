@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,11 @@ from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
 
 log = logging.getLogger(__name__)
+
+A = TypeVar("A")
+B = TypeVar("B")
+P = TypeVar("P")
+Q = TypeVar("Q")
 
 DEFAULT_PROMPT = "Please segment all vehicles, pedestrians and cyclists on the road."
 
@@ -150,29 +156,45 @@ class PerceptionModels:
         return await self._detect_then_segment(take, stream)
 
     async def _detect_then_segment(self, take: TakeRequest, stream: str) -> Perception | None:
-        claim = _Claim(take)
-        detected = await self._detector_runner.infer(claim.detection)
-        request = claim.request
-        if detected is None or request is None:
+        taken: list[PerceptionRequest] = []
+        detected = await self._detector_runner.infer(_noting(take, taken, _detection_request))
+        if detected is None:
             return None
+        (request,) = taken
         detections, doubtful = _by_score(detected.value, request.min_score)
         context = FrameContext(request.sequence, detections, stream, doubtful)
         segmented = await self._segmenter_runner.infer(lambda: _segmentation_request(request, context))
         return None if segmented is None else _perception(detections, detected, segmented)
 
     async def _detect_beside_segment(self, take: TakeRequest, stream: str) -> Perception | None:
-        claim = _Claim(take)
-        detection = asyncio.ensure_future(self._detector_runner.infer(claim.detection))
-        segmentation = asyncio.ensure_future(self._segmenter_runner.infer(lambda: claim.segmentation(stream)))
-        try:
-            detected, segmented = await asyncio.gather(detection, segmentation)
-        finally:
-            detection.cancel()
-            segmentation.cancel()
-        request = claim.request
-        if detected is None or segmented is None or request is None:
+        """The busier model chooses the frame, and the other one joins in.
+
+        Were it the other way round, the frame would grow old in the busier one's queue.
+        """
+        taken: list[PerceptionRequest] = []
+
+        def segmentation_request(request: PerceptionRequest) -> SegmentationRequest:
+            return _segmentation_request(request, FrameContext(request.sequence, Detections.empty(), stream))
+
+        detected: ModelRun[Detections] | None
+        segmented: ModelRun[Segmentation] | None
+        if self._detector_runner.backlog_s() >= self._segmenter_runner.backlog_s():
+            detected, segmented = await _together(
+                self._detector_runner,
+                _noting(take, taken, _detection_request),
+                self._segmenter_runner,
+                lambda: segmentation_request(taken[0]),
+            )
+        else:
+            segmented, detected = await _together(
+                self._segmenter_runner,
+                _noting(take, taken, segmentation_request),
+                self._detector_runner,
+                lambda: _detection_request(taken[0]),
+            )
+        if detected is None or segmented is None:
             return None
-        return _perception(_by_score(detected.value, request.min_score)[0], detected, segmented)
+        return _perception(_by_score(detected.value, taken[0].min_score)[0], detected, segmented)
 
     def forget_stream(self, stream: str) -> None:
         """Lets the segmenter drop what it keeps of an ended session, once it has answered that session's frames.
@@ -192,28 +214,46 @@ class PerceptionModels:
             log.exception("segmenter %s did not forget session %s", self.segmenter.name, stream)
 
 
-class _Claim:
-    """Takes a request once, for both models: the frame is settled when the first of them begins."""
+async def _together(
+    leader: ModelRunner[A, P], lead: Callable[[], A | None], follower: ModelRunner[B, Q], follow: Callable[[], B | None]
+) -> tuple[ModelRun[P] | None, ModelRun[Q] | None]:
+    """Queues for the leader; its frame goes to the follower as soon as the leader has taken it."""
+    context = contextvars.copy_context()
+    following: list[asyncio.Task[ModelRun[Q] | None]] = []
 
-    def __init__(self, take: TakeRequest) -> None:
-        self._take: TakeRequest | None = take
-        self.request: PerceptionRequest | None = None
+    def take() -> A | None:
+        item = lead()
+        if item is not None:
+            # Called in whichever session's task completes the batch; what follows belongs to this one's.
+            following.append(asyncio.create_task(follower.infer(follow), context=context))
+        return item
 
-    def settle(self) -> PerceptionRequest | None:
-        take, self._take = self._take, None
-        if take is not None:
-            self.request = take()
-        return self.request
+    try:
+        led = await leader.infer(take)
+        return (led, await following[0]) if led is not None and following else (None, None)
+    finally:
+        for task in following:
+            task.cancel()
+        await asyncio.gather(*following, return_exceptions=True)
 
-    def detection(self) -> DetectionRequest | None:
-        request = self.settle()
-        return None if request is None else DetectionRequest(request.image, request.roi)
 
-    def segmentation(self, stream: str) -> SegmentationRequest | None:
-        request = self.settle()
+def _noting(
+    take: TakeRequest, taken: list[PerceptionRequest], convert: Callable[[PerceptionRequest], A]
+) -> Callable[[], A | None]:
+    """Gives what ``take`` gives as a model wants it, and puts it down in ``taken``."""
+
+    def give() -> A | None:
+        request = take()
         if request is None:
             return None
-        return _segmentation_request(request, FrameContext(request.sequence, Detections.empty(), stream))
+        taken.append(request)
+        return convert(request)
+
+    return give
+
+
+def _detection_request(request: PerceptionRequest) -> DetectionRequest:
+    return DetectionRequest(request.image, request.roi)
 
 
 def _by_score(found: Detections, min_score: float) -> tuple[Detections, Detections]:
