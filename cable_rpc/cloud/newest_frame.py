@@ -49,6 +49,8 @@ class NewestFrame:
         self._newest: WaitingFrame | None = None
         self._overtaken: deque[_OvertakenFrame] = deque()
         self._arrived = asyncio.Event()
+        self.overtaken = 0
+        """By the frame that was taken last."""
 
     def offer(self, frame: WaitingFrame) -> None:
         """Puts a frame in, in place of the one that is there."""
@@ -68,6 +70,7 @@ class NewestFrame:
         self._arrived.clear()
         if frame is None:
             return None
+        self.overtaken = len(self._overtaken)
         while self._overtaken:
             old = self._overtaken.popleft()
             text = f"frame {old.sequence} was overtaken by {frame.sequence}"

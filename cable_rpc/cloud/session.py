@@ -17,6 +17,7 @@ from google.rpc import code_pb2, status_pb2
 from cable_rpc.cloud.admission import AdmissionControl, StreamShare
 from cable_rpc.cloud.answer_queue import Answer, AnswerQueue, Response
 from cable_rpc.cloud.bounds import check_codec_config, check_hello, check_task
+from cable_rpc.cloud.credit_advice import CreditAdvice
 from cable_rpc.cloud.frame_answers import rejection_of, resolve, result_of
 from cable_rpc.cloud.limits import ANYBODY, Identity
 from cable_rpc.cloud.newest_frame import NewestFrame, WaitingFrame
@@ -73,6 +74,7 @@ class PerceptionSession:
         self._share: StreamShare | None = None
         self._answers = AnswerQueue()
         self._newest = NewestFrame(limits.latency_bound_s)
+        self._credit = CreditAdvice(limits.max_in_flight)
         self._decoder: StreamDecoder | None = None
         self._codec: pb.Codec = pb.CODEC_UNSPECIFIED
         self._task = pb.TaskConfig()
@@ -143,6 +145,7 @@ class PerceptionSession:
     def _flow(self) -> pb.FlowUpdate:
         """The limits of this stream as the client is told them."""
         flow = self._limits.flow()
+        flow.max_in_flight = self._credit.in_flight
         if self._share is not None:
             flow.max_frame_rate = self._share.frame_rate_advice
         return flow
@@ -331,11 +334,13 @@ class PerceptionSession:
             if frame is None:
                 return None
             taken.append(frame)
+            self._credit.frame_taken(self._newest.overtaken)
             min_score = self._task.min_score or self._limits.default_min_score
             return PerceptionRequest(
                 frame.decoded.image, frame.decoded.roi, min_score, self._task.prompt, frame.sequence
             )
 
+        advised = self._credit.in_flight
         try:
             perception = await self._models.perceive_newest(take, self.session_id)
         except asyncio.CancelledError:
@@ -351,3 +356,8 @@ class PerceptionSession:
         if perception is not None:
             (frame,) = taken
             resolve(frame.answer, result_of(frame.sequence, frame.timing, perception))
+            self._credit.frame_answered(
+                sum(run.wait_ns for run in perception.stages), sum(run.run_ns for run in perception.stages)
+            )
+        if self._credit.in_flight != advised:
+            self._answers.send(Response(flow_update=self._flow()))

@@ -186,3 +186,30 @@ async def test_measuring_runs_put_one_model_after_the_other() -> None:
     assert segment.start_time_ns >= detect.start_time_ns + detect.run_ns
     assert perception.segmentation.mask.sum() == 50
     models.close()
+
+
+async def test_a_stream_whose_frames_overtake_each_other_is_advised_to_send_one_at_a_time(stub_for: Any) -> None:
+    class SlowDetector(BrightBoxDetector):
+        def detect(self, images: Sequence[Image]) -> list[Detections]:
+            threading.Event().wait(0.02)
+            return super().detect(images)
+
+    models = PerceptionModels.in_process(SlowDetector(), LookingSegmenter())
+    packet = packets(1)[0]
+    async with serving(models) as server, stub_for(f"127.0.0.1:{server.port}") as stub:
+
+        async def flood() -> int:
+            """As many frames as the grant allows until the advice comes; returns it."""
+            call = await opened(stub)
+            for sequence in range(2):
+                await call.write(frame(sequence, packet))
+            for sequence in range(2, 200):
+                answer = await read(call)
+                if answer.WhichOneof("payload") == "flow_update":
+                    call.cancel()
+                    return answer.flow_update.max_in_flight
+                await call.write(frame(sequence, packet))
+            raise AssertionError("no advice")
+
+        assert await asyncio.gather(*(flood() for _ in range(4))) == [1] * 4
+    models.close()
