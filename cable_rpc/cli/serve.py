@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from cable_rpc.cli.serve_operations import MetricsListen, Reflection
 from cable_rpc.cli.serve_scheduling import (
     BatchWait,
     DetectorBatch,
@@ -31,6 +32,7 @@ from cable_rpc.cli.serve_security import (
     check_exposure,
 )
 from cable_rpc.errors import ConfigurationError
+from cable_rpc.wire.address import is_loopback
 
 
 def serve(
@@ -74,6 +76,8 @@ def serve(
     tls_client_ca: TlsClientCa = None,
     tokens: Tokens = None,
     drain_to: DrainTo = "",
+    metrics_listen: MetricsListen = "",
+    reflection: Reflection = None,
     insecure: Annotated[
         bool,
         typer.Option(
@@ -139,6 +143,13 @@ def serve(
         latency_bound_s=latency_bound,
     )
     config = ServerConfig(
-        address=listen, limits=limits, shares=shares, tls=tls, tokens=tokens, alternative_target=drain_to
+        address=listen,
+        limits=limits,
+        shares=shares,
+        tls=tls,
+        tokens=tokens,
+        alternative_target=drain_to,
+        metrics_address=metrics_listen,
+        reflection=(proof or is_loopback(listen)) if reflection is None else reflection,
     )
     asyncio.run(serve_until_signal(models, config, announce=lambda line: print(line, flush=True)))

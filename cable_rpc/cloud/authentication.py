@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import grpc
 
 from cable_rpc.cloud.limits import ANYBODY, Identity
+from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.throttled_log import ThrottledWarning
 from cable_rpc.cloud.tls import certificate_subject
 from cable_rpc.cloud.tokens import AccessFile
@@ -74,8 +75,9 @@ def tokens_of(metadata: Sequence[tuple[str, str | bytes]] | None) -> list[str]:
 class AuthenticationInterceptor(grpc.aio.ServerInterceptor):
     """Ends calls of unknown clients with UNAUTHENTICATED before their handler runs, and tells handlers who calls."""
 
-    def __init__(self, authenticator: Authenticator) -> None:
+    def __init__(self, authenticator: Authenticator, telemetry: Telemetry = NOBODY) -> None:
         self._authenticator = authenticator
+        self._telemetry = telemetry
 
     async def intercept_service(
         self,
@@ -124,6 +126,7 @@ class AuthenticationInterceptor(grpc.aio.ServerInterceptor):
         try:
             identity = self._authenticator.identify(tokens_of(tuple(context.invocation_metadata() or ())), subject)
         except AuthenticationError as error:
+            self._telemetry.authentication_failed()
             warn_of_refusal("refused a call from %s: %s", context.peer(), error)
             await context.abort(error.code, str(error))
         current_identity.set(identity)

@@ -73,6 +73,9 @@ class BatchingRunner(Generic[Item, Answer]):
         name: of its threads.
         run_batch: the model: one answer for each item, in their order; runs in a worker thread.
         policy: sizes and times.
+
+    Attributes:
+        batch_done: is told the size of each batch and the nanoseconds that it ran; called on the event loop.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class BatchingRunner(Generic[Item, Answer]):
         self._alarm_loop: asyncio.AbstractEventLoop | None = None
         self._loop: asyncio.AbstractEventLoop
         self._item_run_s = 0.0
+        self.batch_done: Callable[[int, int], None] = lambda size, run_ns: None
 
     async def infer(self, take: Callable[[], Item | None]) -> ModelRun[Answer] | None:
         """See `ModelRunner`."""
@@ -186,6 +190,7 @@ class BatchingRunner(Generic[Item, Answer]):
         return _Outcome(answers, started_ns, time.monotonic_ns() - started_ns)
 
     def _finish(self, places: list[_Place[Item, Answer]], outcome: _Outcome[Answer]) -> None:
+        self.batch_done(len(places), outcome.run_ns)
         latest_s = outcome.run_ns / 1e9 / len(places)
         self._item_run_s += (latest_s - self._item_run_s) * (RUN_TIME_WEIGHT if self._item_run_s else 1.0)
         for place, answer in zip(places, outcome.answers, strict=True):

@@ -16,6 +16,7 @@ from cable_rpc.cloud.backends import BatchSegmenter, Detector, FrameContext, Seg
 from cable_rpc.cloud.batching import BatchingRunner, BatchPolicy
 from cable_rpc.cloud.model_batches import DetectionRequest, detect_batch, segment_batch
 from cable_rpc.cloud.model_runner import ModelRun, ModelRunner
+from cable_rpc.cloud.telemetry import Telemetry
 from cable_rpc.types import BoolMask, Detections, Image, Segmentation
 
 log = logging.getLogger(__name__)
@@ -129,6 +130,12 @@ class PerceptionModels:
             BatchingRunner("segmenter", partial(segment_batch, segmenter), segmenter_batches),
             side_by_side=side_by_side,
         )
+
+    def tell_batches(self, telemetry: Telemetry) -> None:
+        """From now on, batches that run in this process are told of."""
+        for model, runner in (("detect", self._detector_runner), ("segment", self._segmenter_runner)):
+            if isinstance(runner, BatchingRunner):
+                runner.batch_done = partial(telemetry.batch_done, model)
 
     def close(self) -> None:
         """Ends the models' threads after what they are doing."""

@@ -9,7 +9,7 @@ import signal
 import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import aclosing
+from contextlib import ExitStack, aclosing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,20 @@ from typing import Any
 import grpc
 from cable_codecs import available_codecs
 from google.rpc import code_pb2, status_pb2
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
 
 import cable_rpc
 from cable_rpc.cloud.admission import AdmissionControl
 from cable_rpc.cloud.authentication import AuthenticationInterceptor, Authenticator, current_identity
 from cable_rpc.cloud.limits import ServerLimits
+from cable_rpc.cloud.metrics import ServerMetrics
+from cable_rpc.cloud.metrics_endpoint import MetricsEndpoint
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.request_bounds import RequestBounds
 from cable_rpc.cloud.session import PerceptionSession, model_infos
 from cable_rpc.cloud.session_limits import SessionLimits
+from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
 from cable_rpc.cloud.tokens import AccessFile
 from cable_rpc.errors import ConfigurationError, Refusal
@@ -36,6 +41,7 @@ from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
 log = logging.getLogger(__name__)
 
+SERVICE = pb.DESCRIPTOR.services_by_name["PerceptionService"].full_name
 SPARE_RPCS = 16
 """Calls beside the streams: clocks, questions about the server, and streams that are told in band that it is full."""
 
@@ -64,14 +70,20 @@ class ServerConfig:
     """How often the token file is looked at."""
     alternative_target: str = ""
     """Where clients are sent when this server stops; empty = they come back here."""
+    metrics_address: str = ""
+    """host:port for Prometheus and HTTP probes; empty = none."""
+    reflection: bool = True
+    """The contract is told to those who ask for it by gRPC's server reflection."""
 
 
 class PerceptionService(pb_grpc.PerceptionServiceServicer):
     """cable.v1.PerceptionService."""
 
-    def __init__(self, models: PerceptionModels, config: ServerConfig) -> None:
+    def __init__(self, models: PerceptionModels, config: ServerConfig, telemetry: Telemetry = NOBODY) -> None:
         self._models = models
         self._config = config
+        self._telemetry = telemetry
+        models.tell_batches(telemetry)
         self._decode_executor = ThreadPoolExecutor(config.decode_threads, thread_name_prefix="decode")
         self._admission = AdmissionControl(config.shares)
         self._sessions: set[PerceptionSession] = set()
@@ -88,6 +100,7 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
             self._decode_executor,
             admission=self._admission,
             identity=current_identity.get(),
+            telemetry=self._telemetry,
         )
         self._sessions.add(session)
         self._idle.clear()
@@ -164,15 +177,18 @@ class PerceptionServer:
         ConfigurationError: a certificate, a key or the token file can't be used.
     """
 
-    def __init__(self, models: PerceptionModels, config: ServerConfig) -> None:
+    def __init__(self, models: PerceptionModels, config: ServerConfig, telemetry: Telemetry = NOBODY) -> None:
         self._config = config
+        self._telemetry = telemetry
         self._credentials = None if config.tls is None else RenewingCredentials(config.tls).credentials()
         self._access = None if config.tokens is None else AccessFile(config.tokens)
         self._authenticator = Authenticator(self._access)
-        self._service = PerceptionService(models, config)
+        self._service = PerceptionService(models, config, telemetry)
+        self._health = health.aio.HealthServicer()
         self._server: grpc.aio.Server | None = None
         self._watch: asyncio.Task[None] | None = None
         self.port = 0
+        self.is_serving = False
 
     async def __aenter__(self) -> PerceptionServer:
         """Starts listening.
@@ -181,12 +197,15 @@ class PerceptionServer:
             ConfigurationError: if the address can't be bound.
         """
         self._server = grpc.aio.server(
-            interceptors=[AuthenticationInterceptor(self._authenticator), RequestBounds()],
+            interceptors=[AuthenticationInterceptor(self._authenticator, self._telemetry), RequestBounds()],
             options=server_options(self._config.max_message_bytes),
             maximum_concurrent_rpcs=self._config.shares.streams + SPARE_RPCS,
             compression=grpc.Compression.NoCompression,
         )
         pb_grpc.add_PerceptionServiceServicer_to_server(self._service, self._server)
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        if self._config.reflection:
+            reflection.enable_server_reflection((SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server)
         try:
             if self._credentials is None:
                 self.port = self._server.add_insecure_port(self._config.address)
@@ -198,6 +217,9 @@ class PerceptionServer:
                 "machine's; choose another with --listen"
             ) from error
         await self._server.start()
+        for name in ("", SERVICE):
+            await self._health.set(name, health_pb2.HealthCheckResponse.SERVING)
+        self.is_serving = True
         if self._access is not None:
             self._watch = asyncio.create_task(self._watch_access(self._access))
         return self
@@ -206,6 +228,8 @@ class PerceptionServer:
         """Answers what is in flight, sends clients away, stops."""
         if self._watch is not None:
             self._watch.cancel()
+        self.is_serving = False
+        await self._health.enter_graceful_shutdown()
         await self._service.drain()
         if self._server is not None:
             await self._server.stop(grace=0.5)
@@ -230,9 +254,18 @@ async def serve_until_signal(models: PerceptionModels, config: ServerConfig, ann
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    async with PerceptionServer(models, config) as server:
-        announce(f"listening on {config.address.rpartition(':')[0]}:{server.port}")
-        for model in (models.detector, models.segmenter):
-            announce(f"  {model.name}  revision {model.revision}  on {model.device}")
-        await stopped.wait()
-        announce("stopping: answering what is in flight")
+    metrics = ServerMetrics() if config.metrics_address else None
+    server = PerceptionServer(models, config, metrics or NOBODY)
+    with ExitStack() as stack:
+        # Metrics outlive the drain: what happens in it is counted too.
+        if metrics is not None:
+            endpoint = MetricsEndpoint(config.metrics_address, metrics.registry, lambda: server.is_serving)
+            stack.enter_context(endpoint)
+        async with server:
+            announce(f"listening on {config.address.rpartition(':')[0]}:{server.port}")
+            for model in (models.detector, models.segmenter):
+                announce(f"  {model.name}  revision {model.revision}  on {model.device}")
+            if metrics is not None:
+                announce(f"  metrics on http://{config.metrics_address.rpartition(':')[0]}:{endpoint.port}/metrics")
+            await stopped.wait()
+            announce("stopping: answering what is in flight")

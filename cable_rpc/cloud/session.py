@@ -25,6 +25,7 @@ from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.public_text import log_text, public_text
 from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
+from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.throttled_log import ThrottledWarning
 from cable_rpc.errors import CableError, ProtocolError, Refusal
 from cable_rpc.wire.convert import PROTOCOL_REVISION, status_of
@@ -54,6 +55,7 @@ class PerceptionSession:
         decode_executor: where decoding runs.
         admission: counts the streams of the server; None = one that refuses nothing.
         identity: whose stream it is.
+        telemetry: is told what happens.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class PerceptionSession:
         *,
         admission: AdmissionControl | None = None,
         identity: Identity = ANYBODY,
+        telemetry: Telemetry = NOBODY,
     ) -> None:
         self.session_id = uuid.uuid4().hex[:12]
         self._models = models
@@ -71,6 +74,7 @@ class PerceptionSession:
         self._executor = decode_executor
         self._admission = admission or AdmissionControl()
         self.identity = identity
+        self._telemetry = telemetry
         self._share: StreamShare | None = None
         self._answers = AnswerQueue()
         self._newest = NewestFrame(limits.latency_bound_s)
@@ -85,12 +89,15 @@ class PerceptionSession:
 
     async def run(self, requests: Requests) -> AsyncGenerator[Response, None]:
         """Serves the stream until the client ends it, breaks a rule, or `drain` is called."""
+        self._telemetry.stream_opened()
         reader = asyncio.create_task(self._read_all(requests))
         inference = asyncio.create_task(self._infer_newest())
         try:
             while (response := await self._next_response()) is not None:
+                self._telemetry.response_sent(response)
                 yield response
         finally:
+            self._telemetry.stream_closed()
             reader.cancel()
             inference.cancel()
             await asyncio.gather(reader, inference, return_exceptions=True)
@@ -261,6 +268,7 @@ class PerceptionSession:
             raise ProtocolError(f"sequence must rise: {frame.sequence} came after {self._last_sequence}")
         wait_s = self._share.take_frame(len(frame.data)) if self._share is not None else 0.0
         self._last_sequence = frame.sequence
+        self._telemetry.frame_received(frame)
         answer = self._answers.open_answer()
         timing = pb.ServerTiming(receive_time_ns=received_ns)
         if wait_s:
