@@ -266,6 +266,8 @@ def _detection_request(request: PerceptionRequest) -> DetectionRequest:
 def _by_score(found: Detections, min_score: float) -> tuple[Detections, Detections]:
     """What is asked for, and what is too doubtful."""
     asked_for = found.scores >= min_score
+    if asked_for.all():
+        return found, Detections.empty()
     return found.select(asked_for), found.select(~asked_for)
 
 
