@@ -14,6 +14,10 @@ PANEL = "Scheduling"
 GPU_BATCH, CPU_BATCH = 8, 2
 """Defaults: a GPU takes several frames in hardly more time than one; a CPU gains little and each frame waits longer."""
 
+HAND_OVER_S = 0.2e-3
+"""What a run in another thread costs at least, there and back; a model that is done sooner (an oracle, boxes on small
+pictures) is not handed over."""
+
 DetectorBatch = Annotated[
     int | None,
     typer.Option(
@@ -71,4 +75,4 @@ def batch_policy(size: int | None, device: str, wait_s: float, latency_bound_s: 
     from cable_rpc.cloud.batching import BatchPolicy
 
     usual = CPU_BATCH if "cpu" in device.lower() else GPU_BATCH
-    return BatchPolicy(size or usual, wait_s, workers, latency_bound_s / 2 or math.inf)
+    return BatchPolicy(size or usual, wait_s, workers, latency_bound_s / 2 or math.inf, HAND_OVER_S)

@@ -15,7 +15,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from cable_rpc.cloud.model_runner import ModelRun
 from cable_rpc.errors import ConfigurationError
@@ -39,6 +39,11 @@ class BatchPolicy:
     """Batches that run at a time, each in a thread of its own; the model must allow it."""
     max_run_s: float = math.inf
     """Batches stay so small that they are likely to end within this time."""
+    at_once_s: float = 0.0
+    """A batch that is likely to take less than this runs in the event loop's thread: handing it over would take longer.
+
+    Only for a model that needs nobody else to go on.
+    """
 
     def __post_init__(self) -> None:
         if self.max_batch < 1 or self.workers < 1 or not 0.0 <= self.wait_s <= 10.0 or not self.max_run_s > 0.0:
@@ -90,6 +95,7 @@ class BatchingRunner(Generic[Item, Answer]):
         self._alarm_loop: asyncio.AbstractEventLoop | None = None
         self._loop: asyncio.AbstractEventLoop
         self._item_run_s = 0.0
+        self._calls: set[Future[Any]] = set()
         self.batch_done: Callable[[int, int], None] = lambda size, run_ns: None
 
     async def infer(self, take: Callable[[], Item | None]) -> ModelRun[Answer] | None:
@@ -107,7 +113,10 @@ class BatchingRunner(Generic[Item, Answer]):
 
     async def call(self, function: Callable[[], T]) -> T:
         """See `ModelRunner`."""
-        return await asyncio.get_running_loop().run_in_executor(self._executor, function)
+        call = self._executor.submit(function)
+        self._calls.add(call)
+        call.add_done_callback(self._calls.discard)
+        return await asyncio.wrap_future(call)
 
     def close(self) -> None:
         """See `ModelRunner`."""
@@ -162,10 +171,16 @@ class BatchingRunner(Generic[Item, Answer]):
             else:
                 places.append(place)
                 items.append(item)
-        if items:
+        if items and self._is_short(len(items)):
+            self._settle(places, self._run(items))
+        elif items:
             batch = self._executor.submit(self._run, items)
             self._running[batch] = len(items)
             batch.add_done_callback(partial(self._report, places))
+
+    def _is_short(self, size: int) -> bool:
+        """True for a batch to be run at once; never while something else runs where the model does."""
+        return 0.0 < self._item_run_s * size < self.policy.at_once_s and not self._running and not self._calls
 
     def _report(self, places: list[_Place[Item, Answer]], batch: Future[_Outcome[Answer]]) -> None:
         """In the worker thread, when its batch counts as done."""
@@ -190,6 +205,10 @@ class BatchingRunner(Generic[Item, Answer]):
         return _Outcome(answers, started_ns, time.monotonic_ns() - started_ns)
 
     def _finish(self, places: list[_Place[Item, Answer]], outcome: _Outcome[Answer]) -> None:
+        self._settle(places, outcome)
+        self._schedule()
+
+    def _settle(self, places: list[_Place[Item, Answer]], outcome: _Outcome[Answer]) -> None:
         self.batch_done(len(places), outcome.run_ns)
         latest_s = outcome.run_ns / 1e9 / len(places)
         self._item_run_s += (latest_s - self._item_run_s) * (RUN_TIME_WEIGHT if self._item_run_s else 1.0)
@@ -201,4 +220,3 @@ class BatchingRunner(Generic[Item, Answer]):
             else:
                 wait_ns = outcome.started_ns - place.queued_ns
                 place.answer.set_result(ModelRun(answer, wait_ns, outcome.run_ns, len(places), outcome.started_ns))
-        self._schedule()
