@@ -15,7 +15,6 @@ from cable_rpc.cli.serve_scheduling import (
     DetectorWorkers,
     LatencyBound,
     SegmenterBatch,
-    batch_policy,
 )
 from cable_rpc.cli.serve_security import (
     DrainTo,
@@ -102,9 +101,8 @@ def serve(
         import onnxruntime  # noqa: F401 - asked for here so that its absence gets a sentence
     except ModuleNotFoundError as error:
         raise ConfigurationError("serving needs the cloud extra: pip install 'cable-rpc[cloud]'") from error
-    from cable_rpc.cloud.backends import BackendOptions, load_detector, load_segmenter
     from cable_rpc.cloud.limits import UNLIMITED, IdentityLimits, ServerLimits
-    from cable_rpc.cloud.perception import PerceptionModels
+    from cable_rpc.cloud.model_settings import ModelSettings
     from cable_rpc.cloud.service import ServerConfig, serve_until_signal
     from cable_rpc.cloud.session_limits import SessionLimits
     from cable_rpc.cloud.tls import TlsFiles
@@ -126,15 +124,17 @@ def serve(
             identity_bytes_per_s or UNLIMITED,
         ),
     )
-    options = BackendOptions(device=device, threads=threads, min_score=min_score)
-    # The detector first: it is loaded in a moment, and what is wrong with it should not wait for a large segmenter.
-    hosted_detector = load_detector(detector, options)
-    hosted_segmenter = load_segmenter(segmenter, options)
-    models = PerceptionModels.in_process(
-        hosted_detector,
-        hosted_segmenter,
-        batch_policy(detector_batch, hosted_detector.device, batch_wait, latency_bound, detector_workers),
-        batch_policy(segmenter_batch, hosted_segmenter.device, batch_wait, latency_bound),
+    settings = ModelSettings(
+        detector=detector,
+        segmenter=segmenter,
+        device=device,
+        threads=threads,
+        min_score=min_score,
+        detector_batch=detector_batch,
+        segmenter_batch=segmenter_batch,
+        detector_workers=detector_workers,
+        batch_wait_s=batch_wait,
+        latency_bound_s=latency_bound,
     )
     limits = SessionLimits(
         max_in_flight=max_in_flight,
@@ -152,4 +152,4 @@ def serve(
         metrics_address=metrics_listen,
         reflection=(proof or is_loopback(listen)) if reflection is None else reflection,
     )
-    asyncio.run(serve_until_signal(models, config, announce=lambda line: print(line, flush=True)))
+    asyncio.run(serve_until_signal(settings.load(), config, announce=lambda line: print(line, flush=True)))
