@@ -8,6 +8,17 @@ from typing import Annotated
 
 import typer
 
+from cable_rpc.cli.serve_cluster import (
+    Engine,
+    EngineChoice,
+    ProxyChoice,
+    RayAddress,
+    RayProxy,
+    ReplicaCpus,
+    ReplicaGpus,
+    Replicas,
+    cluster_port,
+)
 from cable_rpc.cli.serve_operations import MetricsListen, Reflection
 from cable_rpc.cli.serve_scheduling import (
     BatchWait,
@@ -83,6 +94,12 @@ def serve(
             "--insecure", help="Allow a non-loopback address without TLS. Only on a network you trust end to end."
         ),
     ] = False,
+    engine: EngineChoice = Engine.IN_PROCESS,
+    ray_address: RayAddress = "",
+    replicas: Replicas = 1,
+    cpus_per_replica: ReplicaCpus = 1.0,
+    gpus_per_replica: ReplicaGpus = 0.0,
+    ray_proxy: ProxyChoice = RayProxy.PYTHON,
 ) -> None:
     """Host the models and answer cameras over gRPC.
 
@@ -108,6 +125,35 @@ def serve(
     from cable_rpc.cloud.tls import TlsFiles
     from cable_rpc.cloud.tokens import AccessFile
 
+    settings = ModelSettings(
+        detector=detector,
+        segmenter=segmenter,
+        device=device,
+        threads=threads,
+        min_score=min_score,
+        detector_batch=detector_batch,
+        segmenter_batch=segmenter_batch,
+        detector_workers=detector_workers,
+        batch_wait_s=batch_wait,
+        latency_bound_s=latency_bound,
+    )
+    if engine is Engine.RAY:
+        from cable_rpc.cloud.cluster.host import ClusterHost, serve_on_cluster
+        from cable_rpc.cloud.cluster.settings import ClusterSettings, ReplicaSettings
+
+        port = cluster_port(listen, tls=tls_cert is not None or tls_client_ca is not None, insecure=insecure)
+        cluster = ClusterSettings(
+            models=settings,
+            ingress=ReplicaSettings(replicas, cpus=cpus_per_replica, gpus=gpus_per_replica),
+            streams=max_streams,
+            pixels_per_s=max_pixels_per_s or 0.0,
+            max_in_flight=max_in_flight,
+            max_frame_bytes=max_frame_bytes,
+            tokens=str(tokens.resolve()) if tokens is not None else "",
+        )
+        host = ClusterHost(port, ray_address=ray_address, proxy=ray_proxy.value)
+        serve_on_cluster(cluster, host, announce=lambda line: print(line, flush=True))
+        return
     tls = TlsFiles.from_flags(tls_cert, tls_key, tls_client_ca)
     # Loading models takes long; what is wrong with the files is said before.
     if tls is not None:
@@ -123,18 +169,6 @@ def serve(
             identity_pixels_per_s or UNLIMITED,
             identity_bytes_per_s or UNLIMITED,
         ),
-    )
-    settings = ModelSettings(
-        detector=detector,
-        segmenter=segmenter,
-        device=device,
-        threads=threads,
-        min_score=min_score,
-        detector_batch=detector_batch,
-        segmenter_batch=segmenter_batch,
-        detector_workers=detector_workers,
-        batch_wait_s=batch_wait,
-        latency_bound_s=latency_bound,
     )
     limits = SessionLimits(
         max_in_flight=max_in_flight,

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import os
 import signal
-import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, aclosing
@@ -15,12 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-from cable_codecs import available_codecs
 from google.rpc import code_pb2, status_pb2
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-import cable_rpc
 from cable_rpc.cloud.admission import AdmissionControl
 from cable_rpc.cloud.authentication import AuthenticationInterceptor, Authenticator, current_identity
 from cable_rpc.cloud.limits import ServerLimits
@@ -28,14 +25,15 @@ from cable_rpc.cloud.metrics import ServerMetrics
 from cable_rpc.cloud.metrics_endpoint import MetricsEndpoint
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.request_bounds import RequestBounds
-from cable_rpc.cloud.session import PerceptionSession, model_infos
+from cable_rpc.cloud.server_info import clock_sample, server_info
+from cable_rpc.cloud.session import PerceptionSession
 from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
 from cable_rpc.cloud.tokens import AccessFile
 from cable_rpc.errors import ConfigurationError, Refusal
 from cable_rpc.wire.channel import MAX_MESSAGE_BYTES, server_options
-from cable_rpc.wire.convert import CODEC_NAMES, PROTOCOL_REVISION, status_of
+from cable_rpc.wire.convert import status_of
 from cable_rpc.wire.v1 import perception_pb2 as pb
 from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
@@ -121,25 +119,13 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
         self, request: pb.GetServerInfoRequest, context: Context
     ) -> pb.GetServerInfoResponse:
         """What this server is."""
-        return pb.GetServerInfoResponse(
-            protocol_revision=PROTOCOL_REVISION,
-            server_version=f"cable-rpc/{cable_rpc.__version__}",
-            codecs=[number for number, name in CODEC_NAMES.items() if name in available_codecs()],
-            models=model_infos(self._models),
-            flow=self._config.limits.flow(),
-            max_pixels=self._config.limits.max_pixels,
-        )
+        return server_info(self._models, self._config.limits)
 
     async def SyncClock(  # noqa: N802
         self, request: pb.SyncClockRequest, context: Context
     ) -> pb.SyncClockResponse:
         """One clock sample."""
-        received_ns = time.monotonic_ns()
-        return pb.SyncClockResponse(
-            client_send_time_ns=request.client_send_time_ns,
-            server_receive_time_ns=received_ns,
-            server_send_time_ns=time.monotonic_ns(),
-        )
+        return clock_sample(request)
 
     def send_away_unknown(self, authenticator: Authenticator) -> None:
         """Ends the sessions of those who may no longer come."""

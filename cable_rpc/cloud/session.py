@@ -23,6 +23,7 @@ from cable_rpc.cloud.limits import ANYBODY, Identity
 from cable_rpc.cloud.newest_frame import NewestFrame, WaitingFrame
 from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.public_text import log_text, public_text
+from cable_rpc.cloud.server_info import model_infos
 from cable_rpc.cloud.session_limits import SessionLimits
 from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
 from cable_rpc.cloud.telemetry import NOBODY, Telemetry
@@ -35,15 +36,6 @@ log = logging.getLogger(__name__)
 warn_of_refusal = ThrottledWarning(log)
 
 Requests = AsyncIterator[pb.StreamPerceptionRequest]
-
-
-def model_infos(models: PerceptionModels) -> list[pb.ModelInfo]:
-    """The hosted models as the client is told them."""
-    kinds = ((models.detector, pb.RESULT_KIND_DETECTION), (models.segmenter, pb.RESULT_KIND_SEGMENTATION))
-    return [
-        pb.ModelInfo(name=public_text(model.name), revision=model.revision, device=model.device, result_kind=kind)
-        for model, kind in kinds
-    ]
 
 
 class PerceptionSession:
