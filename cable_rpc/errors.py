@@ -47,6 +47,15 @@ class RemoteError(CableError):
     code = grpc.StatusCode.UNAVAILABLE
 
 
+class ConnectionLost(RemoteError):
+    """The way to the other end is broken, or it asks to be called again; carries how."""
+
+    def __init__(self, message: str, *, retry_after_s: float | None = None, alternative_target: str = "") -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s
+        self.alternative_target = alternative_target
+
+
 class AuthenticationError(CableError):
     """The peer did not prove who it is, or is not known here."""
 

@@ -32,7 +32,7 @@ class Capture:
 
     def __init__(self, frames: Iterable[Frame], *, realtime: bool) -> None:
         self._frames = frames
-        self._realtime = realtime
+        self.realtime = realtime
         self._slot: queue.Queue[CapturedFrame | BaseException | None] = queue.Queue(maxsize=1)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name="capture", daemon=True)
@@ -56,7 +56,7 @@ class Capture:
         item = await asyncio.to_thread(self._take)
         if isinstance(item, BaseException):
             raise item
-        if item is None or self._realtime:
+        if item is None or self.realtime:
             return item
         # In lock-step the frame was read ahead and nobody was waiting for it: its life begins when it is taken.
         return replace(item, available_time_ns=time.monotonic_ns())
@@ -85,12 +85,12 @@ class Capture:
             if frame is None:
                 return
             read_ns = time.monotonic_ns() - started_ns
-            if self._realtime:
+            if self.realtime:
                 now_ns = time.monotonic_ns()
                 if first_due_ns is None:
                     first_due_ns = now_ns - frame.capture_time_ns
                 self._stop.wait(max(0, first_due_ns + frame.capture_time_ns - now_ns) / 1e9)
-            self._put(CapturedFrame(frame, read_ns, time.monotonic_ns()), replace=self._realtime)
+            self._put(CapturedFrame(frame, read_ns, time.monotonic_ns()), replace=self.realtime)
 
     def _put(self, item: CapturedFrame | BaseException | None, *, replace: bool = False) -> None:
         while not self._stop.is_set():

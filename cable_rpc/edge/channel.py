@@ -162,10 +162,3 @@ class SecureTarget:
         )
         if reason is not None:
             raise RemoteError(f"{self.address} {reason}")
-
-
-def connection_error(target: str, error: grpc.aio.AioRpcError) -> RemoteError:
-    """A call's status as our error."""
-    if error.code() is grpc.StatusCode.UNAUTHENTICATED:
-        return RemoteError(f"{target} does not let us in: {error.details()}; check --token-file or {TOKEN_VARIABLE}")
-    return RemoteError(f"the connection to {target} broke: {error.code().name} {error.details() or ''}".rstrip())

@@ -78,7 +78,8 @@ class FrameEncoder:
             )
             parameters = replace(parameters, bitrate_kbps=None)
         self._encoder = TreatedEncoder(parameters, self.treatment)
-        self._last_index: int | None = None
+        self.last_index: int | None = None
+        """The frame coded last."""
 
     @property
     def fallback_reason(self) -> str | None:
@@ -120,7 +121,7 @@ class FrameEncoder:
         else:
             sent = RoiMask(packet.blocks, packet.block_size, *frame.size_hw)
             message.region.CopyFrom(region_to_message(sent))
-        self._last_index = frame.index
+        self.last_index = frame.index
         return PreparedFrame(captured, proposal, packet.encoded, message, sent, roi_ns, packet.treat_ns)
 
     def close(self) -> None:
@@ -148,6 +149,6 @@ class FrameEncoder:
             message.prior_sequence = proposal.prior_index
         if frame.ego is not None:
             message.ego_motion.CopyFrom(ego_to_message(frame.ego))
-        if not (self._is_still or encoded.keyframe) and self._last_index is not None:
-            message.reference_sequence = self._last_index
+        if not (self._is_still or encoded.keyframe) and self.last_index is not None:
+            message.reference_sequence = self.last_index
         return message

@@ -9,7 +9,8 @@ from typing import Any
 
 import grpc
 
-from cable_rpc.edge.channel import SecureTarget, connection_error
+from cable_rpc.edge.channel import SecureTarget
+from cable_rpc.edge.transport_errors import connection_error
 from cable_rpc.errors import RemoteError
 from cable_rpc.wire.convert import CODEC_NAMES
 from cable_rpc.wire.v1 import perception_pb2 as pb

@@ -15,8 +15,9 @@ from cable_rpc.edge.streamer import StreamedFrame
 from cable_rpc.study.annotate import AnnotatedVideoWriter, annotate, status_line
 from cable_rpc.study.language_record import language_columns, segment_parts, whole_prefill
 from cable_rpc.study.metrics import match_detections, recognition_curve, retained, visible_truth
-from cable_rpc.study.run_record import STILLS_FOLDER, VIDEO_FILE, FrameRecord
+from cable_rpc.study.run_record import STILLS_FOLDER, VIDEO_FILE, FrameRecord, Outcome
 from cable_rpc.types import BoolMask, Detections, Frame, Image, RoiMask
+from cable_rpc.wire.answers import FrameAnswer
 from cable_rpc.wire.clock import ClockOffset
 
 STILL_COUNT = 4
@@ -74,6 +75,7 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
     prepared, answer = streamed.prepared, streamed.answer
     proposal, message, times = prepared.proposal, prepared.message, answer.times
     segmentation = answer.segmentation
+    heard = not answer.is_lost
     uplink_ns = downlink_ns = None
     if clock_offset is not None and times.receive_time_ns:
         uplink_ns = clock_offset.to_client(times.receive_time_ns) - message.send_time_ns
@@ -81,7 +83,7 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
     record = FrameRecord(
         index=prepared.index,
         capture_time_ns=prepared.captured.frame.capture_time_ns,
-        outcome="answered" if answer.rejection is None else "rejected",
+        outcome=outcome_of(answer),
         keyframe=proposal.keyframe,
         keyframe_reason=proposal.keyframe_reason or "",
         idr=prepared.encoded.keyframe,
@@ -98,21 +100,28 @@ def record_of(streamed: StreamedFrame, clock_offset: ClockOffset | None) -> Fram
         fill_ns=prepared.fill_ns,
         encode_ns=prepared.encoded.duration_ns,
         uplink_ns=uplink_ns,
-        queue_ns=times.queue_ns,
-        decode_ns=times.decode_ns,
+        queue_ns=times.queue_ns if heard else None,
+        decode_ns=times.decode_ns if heard else None,
         detect_ns=times.run_ns.get("detect"),
         segment_ns=times.run_ns.get("segment"),
         **segment_parts(times.parts_of("segment")),
-        server_ns=times.send_time_ns - times.receive_time_ns,
+        server_ns=times.send_time_ns - times.receive_time_ns if heard else None,
         downlink_ns=downlink_ns,
-        apply_ns=streamed.apply_ns,
-        end_to_end_ns=streamed.applied_time_ns - prepared.captured.available_time_ns,
-        detection_count=len(answer.detections),
+        apply_ns=streamed.apply_ns if heard else None,
+        end_to_end_ns=streamed.applied_time_ns - prepared.captured.available_time_ns if heard else None,
+        detection_count=len(answer.detections) if heard else None,
         mask_coverage=float(segmentation.mask.mean()) if segmentation else None,
         mask_confidence=segmentation.confidence if segmentation else None,
         **language_columns(segmentation),
     )
     return FrameEvidence(record, prepared.sent_region, answer.detections, answer.mask_data)
+
+
+def outcome_of(answer: FrameAnswer) -> Outcome:
+    """What became of a frame that was sent."""
+    if answer.is_lost:
+        return "lost"
+    return "answered" if answer.rejection is None else "rejected"
 
 
 class RunEvaluator:

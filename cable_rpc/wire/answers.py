@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -57,6 +58,8 @@ class FrameAnswer:
     """The mask's uncertainty as coded on the wire; empty = not told."""
     rejection: str | None = None
     """Why the frame was not processed; None = it was."""
+    is_lost: bool = False
+    """True: no answer came, and none will."""
 
     @classmethod
     def from_result(
@@ -97,6 +100,13 @@ class FrameAnswer:
             b"",
             rejection=f"{reason}: {rejected.message}",
         )
+
+    @classmethod
+    def lost(cls, sequence: int, reason: str) -> FrameAnswer:
+        """What stands for the answer to a frame whose connection broke; received now, without any figures."""
+        nothing = Detections.empty()
+        now_ns = time.monotonic_ns()
+        return cls(sequence, now_ns, 0, ServerTimes(), nothing, None, b"", rejection=f"LOST: {reason}", is_lost=True)
 
 
 def _model_wait_ns(timing: pb.ServerTiming) -> int:
