@@ -38,6 +38,11 @@ class AnswerQueue:
         self._places.append(None)
         self._wake()
 
+    def abandon(self) -> None:
+        """Nothing comes any more, not even what has a place."""
+        self._places.clear()
+        self.end()
+
     async def next(self, timeout_s: float) -> Response | None:
         """The next message, None at the end.
 

@@ -28,6 +28,7 @@ from cable_rpc.cloud.request_bounds import RequestBounds
 from cable_rpc.cloud.server_info import clock_sample, server_info
 from cable_rpc.cloud.session import PerceptionSession
 from cable_rpc.cloud.session_limits import SessionLimits
+from cable_rpc.cloud.session_store import SessionStore, StoreLimits
 from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
 from cable_rpc.cloud.tokens import AccessFile
@@ -58,6 +59,8 @@ class ServerConfig:
     drain_s: float = 5.0
     shares: ServerLimits = field(default_factory=ServerLimits)
     """What all clients together, and each of them, may use."""
+    resume: StoreLimits = field(default_factory=StoreLimits)
+    """How long a session waits for its client to come back."""
     tls: TlsFiles | None = None
     """None = plain text."""
     tokens: Path | None = None
@@ -84,6 +87,7 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
         models.tell_batches(telemetry)
         self._decode_executor = ThreadPoolExecutor(config.decode_threads, thread_name_prefix="decode")
         self._admission = AdmissionControl(config.shares)
+        self._store = SessionStore(config.resume, models.forget_stream)
         self._sessions: set[PerceptionSession] = set()
         self._idle = asyncio.Event()
         self._idle.set()
@@ -99,6 +103,7 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
             admission=self._admission,
             identity=current_identity.get(),
             telemetry=self._telemetry,
+            store=self._store,
         )
         self._sessions.add(session)
         self._idle.clear()
@@ -136,6 +141,7 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
                     code=code_pb2.UNAUTHENTICATED, message="the token is not known here any more"
                 )
                 session.drain(status, pb.CLOSE_ACTION_STOP)
+        self._store.keep_only(authenticator.still_known)
 
     async def drain(self) -> None:
         """Sends every client away, lets no new one in, and waits, bounded, until they have gone."""
@@ -151,8 +157,9 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
         except TimeoutError:
             log.warning("%d sessions did not end in time", len(self._sessions))
 
-    def close(self) -> None:
-        """Frees the decoder threads."""
+    async def close(self) -> None:
+        """Frees the sessions that wait for their clients, and the decoder threads."""
+        await self._store.close()
         self._decode_executor.shutdown(wait=False, cancel_futures=True)
 
 
@@ -219,7 +226,7 @@ class PerceptionServer:
         await self._service.drain()
         if self._server is not None:
             await self._server.stop(grace=0.5)
-        self._service.close()
+        await self._service.close()
 
     async def _watch_access(self, access: AccessFile) -> None:
         while True:

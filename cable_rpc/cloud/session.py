@@ -1,6 +1,6 @@
 """One camera's session: pure asyncio over messages, so that plain grpc.aio and Ray Serve host the same class.
 
-The rules R1-R7 that it keeps stand in proto/cable/v1/perception.proto.
+The rules R1-R8 that it keeps stand in proto/cable/v1/perception.proto.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.public_text import log_text, public_text
 from cable_rpc.cloud.server_info import model_infos
 from cable_rpc.cloud.session_limits import SessionLimits
+from cable_rpc.cloud.session_store import SessionState, SessionStore, StoreLimits
 from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamDecoder
 from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.throttled_log import ThrottledWarning
@@ -39,7 +40,7 @@ Requests = AsyncIterator[pb.StreamPerceptionRequest]
 
 
 class PerceptionSession:
-    """Decodes, perceives and answers one stream; owns nothing that outlives it.
+    """Decodes, perceives and answers one stream; what outlives it goes to the store of its server.
 
     Args:
         models: what answers.
@@ -48,6 +49,7 @@ class PerceptionSession:
         admission: counts the streams of the server; None = one that refuses nothing.
         identity: whose stream it is.
         telemetry: is told what happens.
+        store: where sessions wait for their clients to come back; None = none is kept.
     """
 
     def __init__(
@@ -59,8 +61,13 @@ class PerceptionSession:
         admission: AdmissionControl | None = None,
         identity: Identity = ANYBODY,
         telemetry: Telemetry = NOBODY,
+        store: SessionStore | None = None,
     ) -> None:
-        self.session_id = uuid.uuid4().hex[:12]
+        self._state = SessionState(uuid.uuid4().hex[:12])
+        self._store = store or SessionStore(StoreLimits(window_s=0.0), models.forget_stream)
+        self._token = b""
+        self._keep = True
+        self._winding_up: asyncio.Future[None] | None = None
         self._models = models
         self._limits = limits
         self._executor = decode_executor
@@ -71,34 +78,48 @@ class PerceptionSession:
         self._answers = AnswerQueue()
         self._newest = NewestFrame(limits.latency_bound_s)
         self._credit = CreditAdvice(limits.max_in_flight)
-        self._decoder: StreamDecoder | None = None
-        self._codec: pb.Codec = pb.CODEC_UNSPECIFIED
-        self._task = pb.TaskConfig()
-        self._last_sequence: int | None = None
         self._keyframe_requested = False
         self._closing = False
         self._heard_s = time.monotonic()
+        self._tasks: list[asyncio.Task[None]] = []
+
+    @property
+    def session_id(self) -> str:
+        """Name of the session; a stream that takes one over takes its name."""
+        return self._state.session_id
 
     async def run(self, requests: Requests) -> AsyncGenerator[Response, None]:
         """Serves the stream until the client ends it, breaks a rule, or `drain` is called."""
         self._telemetry.stream_opened()
-        reader = asyncio.create_task(self._read_all(requests))
-        inference = asyncio.create_task(self._infer_newest())
+        self._tasks = [asyncio.create_task(self._read_all(requests)), asyncio.create_task(self._infer_newest())]
         try:
             while (response := await self._next_response()) is not None:
                 self._telemetry.response_sent(response)
                 yield response
         finally:
             self._telemetry.stream_closed()
-            reader.cancel()
-            inference.cancel()
-            await asyncio.gather(reader, inference, return_exceptions=True)
-            if self._share is not None:
-                self._share.release()
-            self._models.forget_stream(self.session_id)
-            if self._decoder is not None:
-                # Cancelling the reader does not stop a decode under way: closing waits for it, off the loop.
-                await asyncio.to_thread(self._decoder.close)
+            await self._end()
+
+    async def give_way(self) -> None:
+        """Ends this stream, whose client has come back on another; its state is in the store then."""
+        log.info("session %s: taken over by a new stream", self.session_id)
+        await self._end()
+        self._answers.abandon()
+
+    async def _end(self) -> None:
+        """Ends the work, once, whoever asks for it first."""
+        if self._winding_up is None:
+            self._winding_up = asyncio.ensure_future(self._wind_up())
+        await asyncio.shield(self._winding_up)
+
+    async def _wind_up(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._share is not None:
+            self._share.release()
+        await self._state.settle()
+        await self._store.leave(self._token, self.identity, self._state, keep=self._keep and bool(self._token))
 
     def drain(self, status: status_pb2.Status, action: pb.CloseAction, alternative_target: str = "") -> None:
         """Tells the client to go; pending frames are still answered, new ones are ignored.
@@ -110,6 +131,7 @@ class PerceptionSession:
         """
         if not self._closing:
             self._closing = True
+            self._keep &= action != pb.CLOSE_ACTION_STOP
             self._heard_s = time.monotonic()
             status.message = public_text(status.message)
             closing = pb.Closing(status=status, action=action, alternative_target=alternative_target)
@@ -153,13 +175,13 @@ class PerceptionSession:
 
     async def _read_all(self, requests: Requests) -> None:
         try:
-            self._share = self._admission.open_stream(self.identity)
-            await self._read_hello(requests)
+            await self._begin(await self._read_hello(requests))
             async for request in requests:
                 self._heard_s = time.monotonic()
                 if self._closing:
                     continue
                 if request.WhichOneof("payload") == "goodbye":
+                    self._keep = request.goodbye.keep_session
                     break
                 await self._handle(request)
         except Refusal as error:
@@ -190,7 +212,7 @@ class PerceptionSession:
         except TimeoutError:
             log.info("session %s: the client did not half-close", self.session_id)
 
-    async def _read_hello(self, requests: Requests) -> None:
+    async def _read_hello(self, requests: Requests) -> pb.Hello:
         try:
             async with asyncio.timeout(self._limits.hello_timeout_s):
                 first = await anext(requests, None)
@@ -208,15 +230,27 @@ class PerceptionSession:
                 "update the older one"
             )
         check_hello(hello)
-        self._configure(hello.codec_config)
-        self._task = hello.task_config
+        return hello
+
+    async def _begin(self, hello: pb.Hello) -> None:
+        # A stream that the client has given up may hold the place that this one needs.
+        await self._store.end_stream(hello.resume_token, self.identity)
+        self._share = self._admission.open_stream(self.identity)
+        kept = self._store.take(hello.resume_token, self.identity)
+        if kept is not None:
+            self._state = kept
+            self._token = hello.resume_token
+        self._configure(hello.codec_config, keep_decoder=True)
+        self._state.task = hello.task_config
+        self._token = self._store.enter(self, self._token)
         self._heard_s = time.monotonic()
         log.info(
-            "session %s of %s: %s %s %dx%d",
+            "session %s of %s%s: %s %s %dx%d",
             self.session_id,
             self.identity.name,
+            "" if kept is None else " resumed",
             log_text(hello.client_id) or "unnamed client",
-            pb.Codec.Name(self._codec),
+            pb.Codec.Name(hello.codec_config.codec),
             hello.codec_config.width,
             hello.codec_config.height,
         )
@@ -225,17 +259,24 @@ class PerceptionSession:
             session_id=self.session_id,
             flow=self._flow(),
             models=model_infos(self._models),
+            resumed=kept is not None,
+            decoded_sequence=self._state.decoded_sequence,
         )
+        if self._store.limits.window_s > 0:
+            welcome.resume_token, welcome.resume_window_s = self._token, self._store.limits.window_s
         self._answers.send(Response(welcome=welcome))
 
-    def _configure(self, config: pb.CodecConfig) -> None:
+    def _configure(self, config: pb.CodecConfig, *, keep_decoder: bool = False) -> None:
         check_codec_config(config, self._limits.max_pixels)
         if self._share is not None:
             self._share.announce(config.width, config.height, config.frame_rate)
+        state = self._state
+        if keep_decoder and state.decoder is not None and state.config == config:
+            return
         decoder = StreamDecoder(config, self._limits.max_pixels)
-        if self._decoder is not None:
-            self._decoder.close()
-        self._decoder, self._codec = decoder, config.codec
+        if state.decoder is not None:
+            state.decoder.close()
+        state.decoder, state.config = decoder, config
         self._keyframe_requested = False
 
     async def _handle(self, request: pb.StreamPerceptionRequest) -> None:
@@ -244,7 +285,7 @@ class PerceptionSession:
             await self._accept(request.frame)
         elif kind == "task_config":
             check_task(request.task_config)
-            self._task = request.task_config
+            self._state.task = request.task_config
         elif kind == "codec_config":
             self._configure(request.codec_config)
         else:
@@ -256,10 +297,10 @@ class PerceptionSession:
             raise ProtocolError(
                 f"frame {frame.sequence} exceeds the credit of {self._limits.max_in_flight} unanswered frames"
             )
-        if self._last_sequence is not None and frame.sequence <= self._last_sequence:
-            raise ProtocolError(f"sequence must rise: {frame.sequence} came after {self._last_sequence}")
+        if self._state.last_sequence is not None and frame.sequence <= self._state.last_sequence:
+            raise ProtocolError(f"sequence must rise: {frame.sequence} came after {self._state.last_sequence}")
         wait_s = self._share.take_frame(len(frame.data)) if self._share is not None else 0.0
-        self._last_sequence = frame.sequence
+        self._state.last_sequence = frame.sequence
         self._telemetry.frame_received(frame)
         answer = self._answers.open_answer()
         timing = pb.ServerTiming(receive_time_ns=received_ns)
@@ -274,8 +315,8 @@ class PerceptionSession:
         except Exception:
             # An answer left open would hold back all later ones.
             log.exception("session %s: decoding frame %d failed", self.session_id, frame.sequence)
-            if self._decoder is not None:
-                self._decoder.mark_lost()
+            if self._state.decoder is not None:
+                self._state.decoder.mark_lost()
             message = f"frame {frame.sequence} can't be decoded; see the server's log"
             self._reject(answer, frame, timing, FrameRejection(pb.REJECT_REASON_UNDECODABLE, message))
             return
@@ -287,7 +328,7 @@ class PerceptionSession:
         self._request_keyframe()
 
     async def _decode(self, frame: pb.VideoFrame, timing: pb.ServerTiming) -> DecodedFrame:
-        decoder = self._decoder
+        decoder = self._state.decoder
         if decoder is None:
             raise ProtocolError("a frame came before any CodecConfig")
         if len(frame.data) > self._limits.max_frame_bytes:
@@ -310,7 +351,7 @@ class PerceptionSession:
         return await asyncio.get_running_loop().run_in_executor(self._executor, timed)
 
     def _request_keyframe(self) -> None:
-        decoder = self._decoder
+        decoder = self._state.decoder
         if decoder is None or self._keyframe_requested:
             return
         if decoder.needs_keyframe:
@@ -335,9 +376,9 @@ class PerceptionSession:
                 return None
             taken.append(frame)
             self._credit.frame_taken(self._newest.overtaken)
-            min_score = self._task.min_score or self._limits.default_min_score
+            min_score = self._state.task.min_score or self._limits.default_min_score
             return PerceptionRequest(
-                frame.decoded.image, frame.decoded.roi, min_score, self._task.prompt, frame.sequence
+                frame.decoded.image, frame.decoded.roi, min_score, self._state.task.prompt, frame.sequence
             )
 
         advised = self._credit.in_flight

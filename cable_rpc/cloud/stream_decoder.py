@@ -92,6 +92,11 @@ class StreamDecoder:
         self.last_good_sequence = frame.sequence
         return DecodedFrame(restored.image, restored.roi)
 
+    def wait_idle(self) -> None:
+        """Returns when no decode is running in another thread."""
+        with self._in_use:
+            pass
+
     def close(self) -> None:
         """Frees the codec, after a decode that is still running in another thread."""
         with self._in_use:
