@@ -86,6 +86,12 @@ def serve(
     tls_client_ca: TlsClientCa = None,
     tokens: Tokens = None,
     drain_to: DrainTo = "",
+    resume_window: Annotated[
+        float,
+        typer.Option(
+            help="Seconds for which a session waits for a client that has lost its connection; 0 = none does.", min=0.0
+        ),
+    ] = 30.0,
     metrics_listen: MetricsListen = "",
     reflection: Reflection = None,
     insecure: Annotated[
@@ -122,6 +128,7 @@ def serve(
     from cable_rpc.cloud.model_settings import ModelSettings
     from cable_rpc.cloud.service import ServerConfig, serve_until_signal
     from cable_rpc.cloud.session_limits import SessionLimits
+    from cable_rpc.cloud.session_store import StoreLimits
     from cable_rpc.cloud.tls import TlsFiles
     from cable_rpc.cloud.tokens import AccessFile
 
@@ -180,6 +187,7 @@ def serve(
         address=listen,
         limits=limits,
         shares=shares,
+        resume=StoreLimits(resume_window),
         tls=tls,
         tokens=tokens,
         alternative_target=drain_to,

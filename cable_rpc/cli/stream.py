@@ -28,6 +28,7 @@ from cable_rpc.cli.skip_bad import SkipBad, bad_frames_listed
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.source import SOURCE_FORMS, FrameSource, open_source
 from cable_rpc.edge.channel import SecureTarget
+from cable_rpc.edge.resuming_client import DEFAULT_RECONNECT_S
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.strategies import STRATEGIES
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
@@ -114,6 +115,15 @@ def stream(
         float, typer.Option(help="Detections below are not sent; can only raise the server's.", min=0.0, max=1.0)
     ] = 0.0,
     connect_timeout: Annotated[float, typer.Option(help="Seconds to wait for the server.", min=0.1)] = 10.0,
+    reconnect_for: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds to look for a server that was lost, before giving up; 0 = never. [default: 60 in realtime, 0 "
+            "in lockstep]",
+            min=0.0,
+            show_default=False,
+        ),
+    ] = None,
     tls: Tls = False,
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
@@ -162,6 +172,7 @@ def stream(
         min_score=min_score,
         client_id=client_id,
         connect_timeout_s=connect_timeout,
+        reconnect_s=reconnect_for if reconnect_for is not None else DEFAULT_RECONNECT_S if pace == "realtime" else 0.0,
         evaluate=evaluate,
         security=security,
         command_line=shlex.join(["cable-rpc", *sys.argv[1:]]),
@@ -184,7 +195,7 @@ def run_and_report(source: FrameSource, config: StreamRunConfig) -> None:
     """Runs with live progress, prints the closing table, writes the report where its extra is installed."""
     try:
         with RunProgress(console, source.frame_count, source.fps) as progress:
-            summary = asyncio.run(StreamRun(source, config, progress.update).run())
+            summary = asyncio.run(StreamRun(source, config, progress.update, say).run())
     except KeyboardInterrupt:
         print(
             f"cable-rpc: interrupted; frames.csv and summary.json in {config.out} hold what came so far",
@@ -198,6 +209,11 @@ def run_and_report(source: FrameSource, config: StreamRunConfig) -> None:
     from cable_rpc.study.report import write_report
 
     console.print(f"report: {write_report(config.out)}")
+
+
+def say(sentence: str) -> None:
+    """What happens to the connection, beside the progress bar."""
+    print(f"cable-rpc: {sentence}", file=sys.stderr)
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import platform
 import shutil
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator
@@ -21,6 +22,7 @@ from cable_rpc.edge.capture import Capture
 from cable_rpc.edge.channel import PLAIN, ClientSecurity
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder
+from cable_rpc.edge.resuming_client import Report, ResumingClient
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.edge.strategy import FullFrame
 from cable_rpc.edge.streamer import EdgeStreamer, StreamedFrame
@@ -42,6 +44,8 @@ from cable_rpc.wire.address import Target
 
 RecordListener = Callable[[str, FrameRecord], None]
 """Is told ("stream" | "evaluate", record) after each frame of each pass."""
+
+log = logging.getLogger(__name__)
 
 VERSIONED_PACKAGES = ("cable-rpc", "av", "grpcio", "numpy", "opencv-python-headless", "protobuf")
 
@@ -71,6 +75,8 @@ class StreamRunConfig:
     min_score: float = 0.0
     client_id: str = ""
     connect_timeout_s: float = 10.0
+    reconnect_s: float = 0.0
+    """How long to look for a server that was lost; 0 = the run ends. The pass of whole frames always ends."""
     evaluate: bool = True
     """Second pass: the same frames whole, for their bytes and detections; quality; annotated video."""
     roi: RoiConfig = field(default_factory=RoiConfig)
@@ -81,12 +87,22 @@ class StreamRunConfig:
 
 
 class StreamRun:
-    """Runs one source once; `run` returns the summary and leaves all files in ``config.out``."""
+    """Runs one source once; `run` returns the summary and leaves all files in ``config.out``.
 
-    def __init__(self, source: FrameSource, config: StreamRunConfig, listener: RecordListener) -> None:
+    Args:
+        source: what is streamed.
+        config: how.
+        listener: is told each frame.
+        report: is told, in a sentence, when the server is lost and found again.
+    """
+
+    def __init__(
+        self, source: FrameSource, config: StreamRunConfig, listener: RecordListener, report: Report = log.warning
+    ) -> None:
         self._source = source
         self._config = config
         self._listener = listener
+        self._report = report
         width, height = source.size_wh
         self._parameters = CodecParameters(
             config.codec,
@@ -146,7 +162,7 @@ class StreamRun:
         strategy = open_strategy(config.strategy, config.roi, config.block_size)
         capture = Capture(self._source, realtime=config.realtime)
         with FrameCsvWriter(config.out / FRAMES_FILE) as csv:
-            async with self._session(realtime=config.realtime) as client:
+            async with self._lasting_session() as client:
                 self._describe(client)
                 encoder = FrameEncoder(strategy, self._parameters, self._treatment)
                 if encoder.fallback_reason is not None:
@@ -163,7 +179,10 @@ class StreamRun:
                 finally:
                     self._describe(client)
                     self._note_rate(encoder)
-                    self._measured_link = measure_link(Target.parse(config.target).address)
+                    self._note_losses(client)
+                    # The counters of connections that have gone went with them.
+                    if not client.reconnects:
+                        self._measured_link = measure_link(Target.parse(config.target).address)
                     self._unsent = [
                         *(FrameRecord(index, 0, "dropped") for index in capture.dropped),
                         *(FrameRecord(index, 0, "lost") for index in streamer.unanswered),
@@ -186,16 +205,34 @@ class StreamRun:
         """The same frames once more, whole, in lock-step: the baseline that savings are measured against."""
         indices = {evidence.record.index for evidence in self._evidence}
         capture = Capture(_only(self._source, indices), realtime=False)
-        async with self._session(realtime=False) as client:
+        async with PerceptionClient(
+            self._config.target,
+            self._request(),
+            security=self._config.security,
+            window=1,
+            connect_timeout_s=self._config.connect_timeout_s,
+        ) as client:
             encoder = FrameEncoder(FullFrame(self._config.block_size), self._parameters, self._treatment)
             streamer = EdgeStreamer(capture, encoder, client)
             async with aclosing(streamer.run()) as streamed_frames:
                 async for streamed in streamed_frames:
                     yield streamed
 
-    def _session(self, *, realtime: bool) -> PerceptionClient:
+    def _lasting_session(self) -> ResumingClient:
+        config = self._config
+        return ResumingClient(
+            config.target,
+            self._request(),
+            security=config.security,
+            window=None if config.realtime else 1,
+            connect_timeout_s=config.connect_timeout_s,
+            reconnect_s=config.reconnect_s,
+            report=self._report,
+        )
+
+    def _request(self) -> SessionRequest:
         config, parameters = self._config, self._parameters
-        request = SessionRequest(
+        return SessionRequest(
             codec=config.codec,
             width=parameters.width,
             height=parameters.height,
@@ -207,16 +244,8 @@ class StreamRun:
             intrinsics=_intrinsics(self._source),
             treatment=self._treatment,
         )
-        window = None if realtime else 1
-        return PerceptionClient(
-            config.target,
-            request,
-            security=config.security,
-            window=window,
-            connect_timeout_s=config.connect_timeout_s,
-        )
 
-    def _describe(self, client: PerceptionClient) -> None:
+    def _describe(self, client: ResumingClient) -> None:
         offset = client.clock_offset
         models = [model.name for model in client.server_info.models]
         self._info = replace(
@@ -240,6 +269,13 @@ class StreamRun:
         if status.frames_at_floor or status.frames_at_ceiling:
             text += f"; out of reach on {status.frames_at_floor + status.frames_at_ceiling} frames"
         self._note(text + ".")
+
+    def _note_losses(self, client: ResumingClient) -> None:
+        if client.reconnects:
+            times = "once" if client.reconnects == 1 else f"{client.reconnects} times"
+            self._note(
+                f"The server was lost and found again {times}; {client.lost_frames} frames were lost on the way."
+            )
 
     def _write(self) -> RunSummary:
         records = [evidence.record for evidence in self._evidence] + self._unsent
