@@ -64,7 +64,7 @@ class PerceptionSession:
         store: SessionStore | None = None,
     ) -> None:
         self._state = SessionState(uuid.uuid4().hex[:12])
-        self._store = store or SessionStore(StoreLimits(window_s=0.0), models.forget_stream)
+        self._store = SessionStore(StoreLimits(window_s=0.0), models.forget_stream) if store is None else store
         self._token = b""
         self._keep = True
         self._winding_up: asyncio.Future[None] | None = None

@@ -154,7 +154,8 @@ class PerceptionClient:
 
     async def __aenter__(self) -> PerceptionClient:
         async with AsyncExitStack() as stack:
-            channel = await stack.enter_async_context(self._way.open_channel())
+            # Shared, the connection could be one that is dead and does not know it.
+            channel = await stack.enter_async_context(self._way.open_channel(own_connection=True))
             clock_channel = await stack.enter_async_context(self._way.open_channel(own_connection=True))
             self._clock = ClockKeeper(pb_grpc.PerceptionServiceStub(clock_channel), self._way.metadata)
             stub = pb_grpc.PerceptionServiceStub(channel)
