@@ -264,5 +264,5 @@ async def test_gives_up_in_time_and_says_why(unused_tcp_port: int) -> None:
         if index == 2:
             await context.__aexit__(None, None, None)
 
-    with pytest.raises(RemoteError, match="no server for .*, gave up"):
+    with pytest.raises(RemoteError, match=r"no server for .*, gave up"):
         await asyncio.wait_for(drive.run(stop), 20)

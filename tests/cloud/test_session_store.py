@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cable_rpc.cloud.limits import Identity
+from cable_rpc.cloud.service import PerceptionServer
 from cable_rpc.cloud.session_store import SessionState, SessionStore, StoreLimits
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
@@ -38,6 +39,15 @@ async def stream(stub: Any, request: pb.StreamPerceptionRequest, who: str = "") 
 async def answered(call: Any, request: pb.StreamPerceptionRequest) -> pb.StreamPerceptionResponse:
     await call.write(request)
     return await read(call)
+
+
+async def kept_in(server: PerceptionServer) -> None:
+    """Returns when the server has noticed that a stream has ended."""
+    for _ in range(500):
+        if len(server._service._store):
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("the session was not kept")
 
 
 def packets(count: int) -> list[EncodedFrame]:
@@ -131,8 +141,7 @@ async def test_foreign_token_gets_nothing_and_takes_nothing(stub_for: Any, tmp_p
         for kept in (False, True):
             if kept:
                 call.cancel()
-                while not len(server._service._store):
-                    await asyncio.sleep(0.01)
+                await kept_in(server)
             foreign, again = await stream(stub, resuming(welcome.resume_token), "bob")
             assert not again.resumed
             assert not again.HasField("decoded_sequence")
