@@ -21,6 +21,8 @@ from cable_rpc.wire.v1 import perception_pb2 as pb
 log = logging.getLogger(__name__)
 
 DEFAULT_RECONNECT_S = 60.0
+STABLE_S = 5.0
+"""A connection that broke sooner counts as one more failed attempt for the next wait."""
 
 Report = Callable[[str], None]
 
@@ -77,6 +79,7 @@ class ResumingClient:
         self._reconnect_s = reconnect_s
         self._report = report
         self._credit = Credit()
+        self._backoff = Backoff()
         self._request = request
         self._unanswered: list[int] = []
         self._last_sent: int | None = None
@@ -151,14 +154,20 @@ class ResumingClient:
         """Stamps a frame and hands it to the transport; where that fails, the frame is reported lost in its turn.
 
         Raises:
+            ConnectionLost: there is no connection now.
             RemoteError: the frame is too large.
         """
+        if not self._is_open:
+            raise ConnectionLost(f"there is no connection to {self.target}")
+        connection = self.connection
         self._unanswered.append(frame.sequence)
         self._last_sent = frame.sequence
         try:
             await self._client.send(frame)
         except ConnectionLost:
-            self._credit.resize(0)
+            # Whoever reads the answers is about to see it too; until then no frame is thrown after it.
+            if self.connection == connection:
+                self._credit.resize(0)
 
     async def finish(self, *, keep_session: bool = False) -> None:
         """No more frames; the server answers what is pending and ends the stream. See `PerceptionClient.finish`."""
@@ -204,7 +213,10 @@ class ResumingClient:
     async def _lose(self, error: ConnectionLost) -> list[FrameAnswer]:
         """Leaves a broken connection; what stands for the answers that it owes."""
         then = "it was all sent" if self._finished else "reconnecting"
-        self._report(f"lost the server after {time.monotonic() - self._opened_s:.1f} s: {error}; {then}")
+        lasted_s = time.monotonic() - self._opened_s
+        self._report(f"lost the server after {lasted_s:.1f} s: {error}; {then}")
+        if lasted_s > STABLE_S:
+            self._backoff = Backoff()
         self.connection += 1
         self._credit.reset(0)
         await self._leave()
@@ -220,9 +232,8 @@ class ResumingClient:
         """
         lost_s = time.monotonic()
         targets = self._targets(error)
-        backoff = Backoff()
         while not self._finished:
-            wait_s = backoff.next_s(error.retry_after_s)
+            wait_s = self._backoff.next_s(error.retry_after_s)
             away_s = time.monotonic() - lost_s
             if away_s + wait_s > self._reconnect_s:
                 raise RemoteError(f"no server for {away_s:.0f} s, gave up: {error}") from error

@@ -6,6 +6,7 @@ import asyncio
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -253,6 +254,32 @@ async def test_killed_server_that_comes_back_is_found_again(
     answered = [record.index for record in records if record.outcome == "answered"]
     assert max(answered) > max((r.index for r in records if r.outcome == "lost"), default=7)
     assert any("lost and found again once" in note for note in summary.info.notes)
+
+
+async def test_a_run_with_lost_frames_is_judged_whole(tmp_path: Path) -> None:
+    """Each answer to a frame number that ends in 4 is lost, and yet the decoder has the frame."""
+    loop = asyncio.get_running_loop()
+
+    class Breaking(Witness):
+        def segment(self, image: Image, roi: BoolMask, prompt: str, context: FrameContext) -> Segmentation:
+            if context.sequence % 10 == 4 and context.sequence not in self.seen:
+                loop.call_soon_threadsafe(relay.reset)
+                time.sleep(0.05)
+            return super().segment(image, roi, prompt, context)
+
+    async with serving(segmenter=Breaking()) as server, relayed(f"127.0.0.1:{server.port}") as relay:
+        config = StreamRunConfig(relay.target, tmp_path, strategy="full-frame", reconnect_s=20.0)
+        summary = await StreamRun(MovingSquare(16, SIZE_WH), config, lambda *_: None, lambda _: None).run()
+    records = read_frames(tmp_path / "frames.csv")
+    assert [record.index for record in records] == list(range(16))
+    assert [record.index for record in records if record.outcome == "lost"] == [4, 14]
+    assert [record.index for record in records if record.idr] == [0]
+    assert (summary.frames.lost, summary.frames.answered) == (2, 14)
+    for record in records:
+        # What was lost has cost its bytes.
+        assert record.bitstream_bytes == record.baseline_bitstream_bytes
+        assert record.roi_psnr_db is not None
+        assert (record.end_to_end_ns is None) == (record.outcome == "lost")
 
 
 async def test_gives_up_in_time_and_says_why(unused_tcp_port: int) -> None:
