@@ -16,9 +16,10 @@ from google.rpc import code_pb2, status_pb2
 
 from cable_rpc.cloud.admission import AdmissionControl, StreamShare
 from cable_rpc.cloud.answer_queue import Answer, AnswerQueue, Response
-from cable_rpc.cloud.bounds import check_codec_config, check_hello, check_task
+from cable_rpc.cloud.bounds import check_codec_config, check_task
 from cable_rpc.cloud.credit_advice import CreditAdvice
 from cable_rpc.cloud.frame_answers import rejection_of, resolve, result_of
+from cable_rpc.cloud.handshake import read_hello
 from cable_rpc.cloud.limits import ANYBODY, Identity
 from cable_rpc.cloud.newest_frame import NewestFrame, WaitingFrame
 from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
@@ -175,7 +176,7 @@ class PerceptionSession:
 
     async def _read_all(self, requests: Requests) -> None:
         try:
-            await self._begin(await self._read_hello(requests))
+            await self._begin(await read_hello(requests, self._limits.hello_timeout_s))
             async for request in requests:
                 self._heard_s = time.monotonic()
                 if self._closing:
@@ -211,26 +212,6 @@ class PerceptionSession:
                     pass
         except TimeoutError:
             log.info("session %s: the client did not half-close", self.session_id)
-
-    async def _read_hello(self, requests: Requests) -> pb.Hello:
-        try:
-            async with asyncio.timeout(self._limits.hello_timeout_s):
-                first = await anext(requests, None)
-        except TimeoutError:
-            raise ProtocolError(f"no Hello within {self._limits.hello_timeout_s:g} s") from None
-        if first is None:
-            raise ProtocolError("the stream ended before its Hello")
-        kind = first.WhichOneof("payload")
-        if kind != "hello":
-            raise ProtocolError(f"the first message must be Hello with a CodecConfig, got {kind or 'nothing'}")
-        hello = first.hello
-        if hello.protocol_revision != PROTOCOL_REVISION:
-            raise ProtocolError(
-                f"the client speaks protocol revision {hello.protocol_revision}, this server {PROTOCOL_REVISION}; "
-                "update the older one"
-            )
-        check_hello(hello)
-        return hello
 
     async def _begin(self, hello: pb.Hello) -> None:
         # A stream that the client has given up may hold the place that this one needs.

@@ -21,8 +21,6 @@ from cable_rpc.wire.v1 import perception_pb2 as pb
 log = logging.getLogger(__name__)
 
 DEFAULT_RECONNECT_S = 60.0
-STABLE_S = 5.0
-"""A connection that broke sooner counts as one more failed attempt for the next wait."""
 
 Report = Callable[[str], None]
 
@@ -208,15 +206,14 @@ class ResumingClient:
     def _answered(self, sequence: int) -> None:
         if sequence in self._unanswered:
             self._unanswered.remove(sequence)
+            # A server that says Welcome and breaks off before it has answered a frame is one more failed attempt.
+            self._backoff = Backoff()
             self._request = replace(self._request, last_result_sequence=sequence)
 
     async def _lose(self, error: ConnectionLost) -> list[FrameAnswer]:
         """Leaves a broken connection; what stands for the answers that it owes."""
         then = "it was all sent" if self._finished else "reconnecting"
-        lasted_s = time.monotonic() - self._opened_s
-        self._report(f"lost the server after {lasted_s:.1f} s: {error}; {then}")
-        if lasted_s > STABLE_S:
-            self._backoff = Backoff()
+        self._report(f"lost the server after {time.monotonic() - self._opened_s:.1f} s: {error}; {then}")
         self.connection += 1
         self._credit.reset(0)
         await self._leave()
