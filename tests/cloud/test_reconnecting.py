@@ -10,7 +10,7 @@ from typing import Any
 import grpc
 import pytest
 from google.rpc import code_pb2, error_details_pb2, status_pb2
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cable_rpc.edge import backoff, client, credit, resuming_client
@@ -261,6 +261,7 @@ async def free_places(session: PerceptionClient) -> int:
     return taken
 
 
+@settings(max_examples=40)
 @given(gaps=st.lists(st.floats(0, 1), min_size=2, max_size=40), rate=st.floats(1, 30))
 async def test_pacer_keeps_to_the_rate_with_one_frame_of_slack(gaps: list[float], rate: float) -> None:
     """Over any stretch of time no more frames are taken than the rate allows, and one that came late."""

@@ -233,7 +233,7 @@ async def test_killed_server_that_comes_back_is_found_again(
         f"127.0.0.1:{unused_tcp_port}", tmp_path, realtime=True, reconnect_s=30.0, evaluate=False, strategy="full-frame"
     )
     try:
-        run = asyncio.create_task(StreamRun(MovingSquare(80, SIZE_WH), config, listen, said.append).run())
+        run = asyncio.create_task(StreamRun(MovingSquare(64, SIZE_WH), config, listen, said.append).run())
         await asyncio.wait_for(reached.wait(), 20)
         servers[0].kill()
         servers[0].wait()
@@ -249,7 +249,7 @@ async def test_killed_server_that_comes_back_is_found_again(
     assert said[-1].startswith("resumed after ")
     assert "new session" in said[-1]
     records = read_frames(tmp_path / "frames.csv")
-    assert [record.index for record in records] == list(range(80))
+    assert [record.index for record in records] == list(range(64))
     assert summary.frames.lost == sum(record.outcome == "lost" for record in records) <= 2
     answered = [record.index for record in records if record.outcome == "answered"]
     assert max(answered) > max((r.index for r in records if r.outcome == "lost"), default=7)
