@@ -36,7 +36,7 @@ class ResumingClient:
 
     With MOVE it goes to the server that was named, under the same security: never from TLS to plain text, never with a
     token in plain text except to this machine, and the certificate must be made out to the new name. Where that one
-    can't be reached it tries its first target in turn.
+    can't be reached it tries its first target in turn; where it refuses, or is not trusted, it goes back there.
 
     Args:
         target: ``grpcs://host:port``, ``grpc://host:port`` or ``host:port``.
@@ -244,6 +244,13 @@ class ResumingClient:
             except ConnectionLost as failure:
                 error = failure
                 targets = self._targets(error) if error.alternative_target else [*targets[1:], target]
+                continue
+            except RemoteError as refusal:
+                if target == self._first_target:
+                    raise
+                # Only our own server's word is final; the one we were sent to may not be its equal.
+                self._report(f"not going to {target}: {refusal}")
+                error, targets = ConnectionLost(str(refusal)), [self._first_target]
                 continue
             if self._client.welcome.models:
                 del info.models[:]

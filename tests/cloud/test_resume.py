@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 import pytest
 from cable_codecs import CodecParameters, RegionTreatment, TreatedDecoder
+from google.rpc import code_pb2, status_pb2
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cable_rpc.cloud.backends import FrameContext
 from cable_rpc.cloud.segmenters import BoxSegmenter
 from cable_rpc.cloud.session_limits import SessionLimits
+from cable_rpc.cloud.tls import TlsFiles
 from cable_rpc.edge import backoff
 from cable_rpc.edge.capture import Capture
+from cable_rpc.edge.channel import ClientSecurity
 from cable_rpc.edge.client import SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder
 from cable_rpc.edge.resuming_client import ResumingClient
@@ -30,7 +33,9 @@ from cable_rpc.errors import RemoteError
 from cable_rpc.study.run_record import read_frames
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
 from cable_rpc.types import BoolMask, Image, Segmentation
+from cable_rpc.wire.v1 import perception_pb2 as pb
 
+from .certificates import Authority
 from .secure_server import serving
 from .tcp_relay import relayed
 from .test_loop import FPS, MovingSquare
@@ -195,6 +200,38 @@ async def test_server_that_stops_sends_its_clients_to_another() -> None:
     assert len(drive.idrs) == 2
     witness = Witness()
     witness.seen = first_seen.seen | second_seen.seen
+    drive.check_pictures(witness)
+
+
+async def test_resumes_over_tls_and_goes_to_no_server_that_it_does_not_trust(tmp_path: Path) -> None:
+    for name in ("ours", "theirs"):
+        (tmp_path / name).mkdir()
+    ours, theirs = Authority(tmp_path / "ours"), Authority(tmp_path / "theirs")
+    files, foreign = (TlsFiles(pair.certificate, pair.key) for pair in (ours.issue("a"), theirs.issue("b")))
+    security = ClientSecurity(authorities=ours.root.certificate)
+    witness = Witness()
+    async with (
+        serving(tls=foreign) as impostor,
+        serving(segmenter=witness, tls=files) as server,
+        relayed(f"127.0.0.1:{server.port}") as relay,
+    ):
+        drive = Drive(f"grpcs://{relay.target}", 12, window=1, security=security)
+
+        async def disturb(index: int) -> None:
+            if index == 3:
+                relay.reset()
+                await asyncio.sleep(0.05)
+            if index == 7:
+                (session,) = server._service._sessions
+                status = status_pb2.Status(code=code_pb2.UNAVAILABLE, message="off to another")
+                session.drain(status, pb.CLOSE_ACTION_MOVE, f"127.0.0.1:{impostor.port}")
+                await asyncio.sleep(0.05)
+
+        await asyncio.wait_for(drive.run(disturb), 20)
+    assert sorted(drive.indices + drive.capture.dropped) == list(range(12))
+    assert drive.client.reconnects == 2
+    assert sum("session kept" in line for line in drive.said) == 2
+    assert any(f"not going to 127.0.0.1:{impostor.port}" in line for line in drive.said)
     drive.check_pictures(witness)
 
 
