@@ -156,6 +156,7 @@ def serve(
             pixels_per_s=max_pixels_per_s or 0.0,
             max_in_flight=max_in_flight,
             max_frame_bytes=max_frame_bytes,
+            resume_window_s=resume_window,
             tokens=str(tokens.resolve()) if tokens is not None else "",
         )
         host = ClusterHost(port, ray_address=ray_address, proxy=ray_proxy.value)

@@ -22,6 +22,7 @@ from cable_rpc.cloud.model_batches import detect_batch, segment_batch
 from cable_rpc.cloud.perception import PerceptionModels
 from cable_rpc.cloud.server_info import clock_sample, server_info
 from cable_rpc.cloud.session import PerceptionSession
+from cable_rpc.cloud.session_store import SessionStore, StoreLimits
 from cable_rpc.cloud.tokens import AccessFile
 from cable_rpc.errors import AuthenticationError
 from cable_rpc.wire.v1 import perception_pb2 as pb
@@ -46,6 +47,7 @@ class PerceptionIngress:
         self._authenticator = Authenticator(None if tokens is None else AccessFile(tokens))
         if detector is None and segmenter is None:
             self._models = settings.models.load()
+        self._store = SessionStore(StoreLimits(window_s=settings.resume_window_s), self._forget)
         self._loading = asyncio.Lock()
 
     async def StreamPerception(  # noqa: N802 - the wire name
@@ -64,6 +66,7 @@ class PerceptionIngress:
             self._decode_executor,
             admission=self._admission,
             identity=identity,
+            store=self._store,
         )
         async with aclosing(session.run(request_stream)) as responses:
             async for response in responses:
@@ -82,6 +85,10 @@ class PerceptionIngress:
     ) -> pb.SyncClockResponse:
         """One clock sample: of this replica's machine, and so of no use where the stream is on another one."""
         return clock_sample(request) if self._lets_in(grpc_context) else pb.SyncClockResponse()
+
+    def _forget(self, stream: str) -> None:
+        if self._models is not None:
+            self._models.forget_stream(stream)
 
     def _identify(self, context: RayServegRPCContext) -> Identity:
         return self._authenticator.identify(tokens_of(context.invocation_metadata()), None)

@@ -54,6 +54,8 @@ class ClusterSettings:
     max_frame_bytes: int = 2 << 20
     tokens: str = ""
     """File of who may come, at that path on every node; empty = everybody who can connect."""
+    resume_window_s: float = 30.0
+    """How long a replica keeps a session whose stream broke; another replica begins anew, with a keyframe."""
     drain_s: float = 10.0
     """How long a replica that is to stop goes on with its sessions."""
 
