@@ -1,67 +1,36 @@
-"""Damaged messages over real sockets: the server answers or closes, and serves the others meanwhile."""
+"""Damaged and impossible messages over real sockets: the server answers or closes, and serves the others meanwhile."""
 
 from __future__ import annotations
 
 import asyncio
 import random
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import grpc
-import numpy as np
 import pytest
-from cable_codecs import encode_mask
+from hypothesis import HealthCheck, given, settings
 
-from cable_rpc.wire.v1 import perception_pb2 as pb
-
-from .secure_server import client, one_frame, serving
-from .test_abuse import STREAM, memory_mb
-from .test_protocol import HEIGHT, WIDTH, coded, frame, hello
+from .hostile_messages import CODECS, damaged, good_session, sessions
+from .secure_server import client, one_frame
+from .server_process import ServerProcess, server_process
+from .test_abuse import STREAM
 
 MESSAGES_PER_STREAM = 8
-CODECS = {pb.CODEC_JPEG: "jpeg", pb.CODEC_WEBP: "webp", pb.CODEC_H264: "h264", pb.CODEC_VP9: "vp9"}
+MOST_GROWTH_MB = 50.0
 
 
-def mutated(data: bytes, source: random.Random) -> bytes:
-    """Flipped bits, a cut, a doubled stretch, noise in the middle, or other bytes altogether."""
-    body = bytearray(data)
-    start = source.randrange(len(body))
-    kind = source.randrange(5)
-    if kind == 0:
-        for _ in range(source.randint(1, 8)):
-            body[source.randrange(len(body))] ^= 1 << source.randrange(8)
-    elif kind == 1:
-        del body[start:]
-    elif kind == 2:
-        body[start:start] = body[start : start + source.randint(1, 64)]
-    elif kind == 3:
-        body[start : start + 8] = source.randbytes(source.randint(0, 16))
-    else:
-        body = bytearray(source.randbytes(source.randint(0, 300)))
-    return bytes(body)
-
-
-def seeds(codec: Any) -> list[bytes]:
-    """Good messages of a session, the Hello first."""
-    blocks = np.zeros((HEIGHT // 8, WIDTH // 8), np.bool_)
-    blocks[2:5, 1:7] = True
-    region = pb.Region(block_size=8, columns=WIDTH // 8, rows=HEIGHT // 8, data=encode_mask(blocks))
-    packets = coded(CODECS[codec], 3)
-    requests = [
-        hello(codec),
-        *(frame(number, packet, region=region) for number, packet in enumerate(packets)),
-        pb.StreamPerceptionRequest(codec_config=hello(codec).hello.codec_config),
-        pb.StreamPerceptionRequest(task_config=pb.TaskConfig(prompt="cars", min_score=0.5)),
-    ]
-    return [request.SerializeToString() for request in requests]
-
-
-async def hostile_stream(channel: grpc.aio.Channel, messages: list[bytes]) -> None:
-    """Sends everything, takes what comes, and must see the end."""
+async def hostile_stream(channel: grpc.aio.Channel, messages: list[bytes]) -> int:
+    """Sends everything, takes what comes, and must see the end; how many messages went before it."""
     call = channel.stream_stream(STREAM)()
+    written = 0
     try:
         async with asyncio.timeout(30):
             for message in messages:
                 await call.write(message)
+                written += 1
             await call.done_writing()
             while await call.read() is not grpc.aio.EOF:
                 pass
@@ -74,45 +43,115 @@ async def hostile_stream(channel: grpc.aio.Channel, messages: list[bytes]) -> No
     finally:
         # Answers that nobody reads would keep the call, and its memory, at this end.
         call.cancel()
+    return written
 
 
-async def attack(streams: int, seed: int) -> float:
-    """Attacks a server while another client works; returns the growth of memory in MB after the first fifth."""
+@dataclass
+class Attack:
+    """Streams of hostile messages to a server, beside a client that must always be served."""
+
+    server: ServerProcess
+    runner: asyncio.Runner
+    stack: AsyncExitStack = field(default_factory=AsyncExitStack)
+    messages: int = 0
+    streams: int = 0
+    served: int = 0
+
+    async def open(self) -> None:
+        self.channel = await self.stack.enter_async_context(grpc.aio.insecure_channel(self.server.target))
+        self.bystander = await self.stack.enter_async_context(client(self.server.target))
+
+    def stream(self, messages: list[bytes]) -> None:
+        self.runner.run(self._stream(messages))
+
+    async def _stream(self, messages: list[bytes]) -> None:
+        self.messages += await hostile_stream(self.channel, messages)
+        if self.streams % 20 == 0:
+            assert (await one_frame(self.bystander, self.streams)).rejection is None
+            self.served += 1
+        self.streams += 1
+
+
+@contextmanager
+def attack() -> Iterator[Attack]:
+    """Afterwards no stream is left, and the bystander has had all its answers."""
+    with server_process() as server, asyncio.Runner() as runner:
+        running = Attack(server, runner)
+        runner.run(running.open())
+        yield running
+        assert running.served == -(-running.streams // 20)
+        runner.run(running.stack.aclose())
+        assert server.streams_left() == 0
+
+
+def growth_mb(running: Attack, streams: int, one: Callable[[], Any]) -> float:
+    """What the server's memory grows by after the first fifth of the streams."""
+    before_mb = 0.0
+    for number in range(streams):
+        one()
+        if number == streams // 5:
+            before_mb = running.server.memory_mb()
+    return running.server.memory_mb() - before_mb
+
+
+def send_damaged(streams: int, seed: int) -> tuple[int, float]:
+    """Messages sent, and what the server grew by in MB."""
     source = random.Random(seed)
-    good = {codec: seeds(codec) for codec in CODECS}
-    answered, before_mb = 0, 0.0
-    async with serving() as server:
-        target = f"127.0.0.1:{server.port}"
-        async with grpc.aio.insecure_channel(target) as channel, client(target) as bystander:
-            for number in range(streams):
-                first, *others = good[source.choice(list(CODECS))]
-                opening = first if source.random() < 0.8 else mutated(first, source)
-                chosen = [source.choice(others) for _ in range(MESSAGES_PER_STREAM)]
-                await hostile_stream(
-                    channel,
-                    [opening, *(mutated(message, source) if source.random() < 0.9 else message for message in chosen)],
-                )
-                if number % 20 == 0:
-                    assert (await one_frame(bystander, number)).rejection is None
-                    answered += 1
-                if number == streams // 5:
-                    before_mb = memory_mb("VmRSS")
-            grown_mb = memory_mb("VmRSS") - before_mb
-        await asyncio.wait_for(server._service._idle.wait(), 10)
-        assert answered == -(-streams // 20)
-        assert server._service._admission.streams == 0
-    return grown_mb
+    good = {codec: [request.SerializeToString() for request in good_session(codec)] for codec in CODECS}
+    with attack() as running:
+
+        def one() -> None:
+            first, *others = good[source.choice(list(CODECS))]
+            opening = first if source.random() < 0.8 else damaged(first, source)
+            chosen = [source.choice(others) for _ in range(MESSAGES_PER_STREAM)]
+            running.stream(
+                [opening, *(damaged(message, source) if source.random() < 0.9 else message for message in chosen)]
+            )
+
+        grown_mb = growth_mb(running, streams, one)
+    return running.messages, grown_mb
 
 
-async def test_mutated_messages() -> None:
-    assert await attack(60, seed=1) < 50
+def send_impossible(streams: int) -> tuple[int, float]:
+    """Messages sent, and what the server grew by in MB. Hypothesis may run a few streams fewer or more."""
+    good = {codec: good_session(codec) for codec in CODECS}
+    with attack() as running:
+        memory_mb: list[float] = []
+
+        @settings(max_examples=streams, database=None, derandomize=True, suppress_health_check=list(HealthCheck))
+        @given(sessions(good))
+        def send(messages: list[bytes]) -> None:
+            running.stream(messages)
+            if running.streams == streams // 5:
+                memory_mb.append(running.server.memory_mb())
+
+        send()
+        grown_mb = running.server.memory_mb() - memory_mb[0]
+    return running.messages, grown_mb
+
+
+def test_damaged_messages() -> None:
+    assert send_damaged(60, seed=1)[1] < MOST_GROWTH_MB
+
+
+def test_impossible_messages() -> None:
+    assert send_impossible(15)[1] < MOST_GROWTH_MB
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-async def test_many_mutated_messages() -> None:
-    """64 000; most streams end with the first of their eight that breaks a rule.
+def test_many_damaged_messages() -> None:
+    """Those that gRPC took before a stream's end; the end of many a stream is the first that breaks a rule."""
+    messages, grown_mb = send_damaged(6000, seed=2)
+    print(f"{messages} damaged messages, the server grew by {grown_mb:.1f} MB")
+    assert messages >= 20_000
+    assert grown_mb < MOST_GROWTH_MB
 
-    The memory is that of both ends. gRPC's client keeps some 3 kB of each call that the server ended while it wrote.
-    """
-    assert await attack(8000, seed=2) < 50
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_many_impossible_messages() -> None:
+    messages, grown_mb = send_impossible(5000)
+    print(f"{messages} impossible messages, the server grew by {grown_mb:.1f} MB")
+    assert messages >= 20_000
+    assert grown_mb < MOST_GROWTH_MB
