@@ -11,6 +11,7 @@ import time
 import uuid
 from collections.abc import AsyncGenerator, AsyncIterator
 from concurrent.futures import Executor
+from functools import partial
 
 from google.rpc import code_pb2, status_pb2
 
@@ -22,7 +23,7 @@ from cable_rpc.cloud.frame_answers import rejection_of, resolve, result_of
 from cable_rpc.cloud.handshake import read_hello
 from cable_rpc.cloud.limits import ANYBODY, Identity
 from cable_rpc.cloud.newest_frame import NewestFrame, WaitingFrame
-from cable_rpc.cloud.perception import PerceptionModels, PerceptionRequest
+from cable_rpc.cloud.perception import Perception, PerceptionModels, PerceptionRequest
 from cable_rpc.cloud.public_text import log_text, public_text
 from cable_rpc.cloud.server_info import model_infos
 from cable_rpc.cloud.session_limits import SessionLimits
@@ -36,6 +37,9 @@ from cable_rpc.wire.v1 import perception_pb2 as pb
 
 log = logging.getLogger(__name__)
 warn_of_refusal = ThrottledWarning(log)
+
+SMALL_MASK_CELLS = 1 << 14
+"""A mask of so few is coded sooner than it is handed to another thread."""
 
 Requests = AsyncIterator[pb.StreamPerceptionRequest]
 
@@ -365,6 +369,7 @@ class PerceptionSession:
         advised = self._credit.in_flight
         try:
             perception = await self._models.perceive_newest(take, self.session_id)
+            result = None if perception is None else await self._coded(taken[0], perception)
         except asyncio.CancelledError:
             raise
         except Exception as error:
@@ -375,11 +380,17 @@ class PerceptionSession:
                 rejection = rejection_of(frame.sequence, frame.timing, pb.REJECT_REASON_MODEL_FAILED, text)
                 resolve(frame.answer, rejection)
             return
-        if perception is not None:
-            (frame,) = taken
-            resolve(frame.answer, result_of(frame.sequence, frame.timing, perception))
+        if perception is not None and result is not None:
+            resolve(taken[0].answer, result)
             self._credit.frame_answered(
                 sum(run.wait_ns for run in perception.stages), sum(run.run_ns for run in perception.stages)
             )
         if self._credit.in_flight != advised:
             self._answers.send(Response(flow_update=self._flow()))
+
+    async def _coded(self, frame: WaitingFrame, perception: Perception) -> Response:
+        """The answer; coding a large mask takes milliseconds, which the other streams must not wait for."""
+        code = partial(result_of, frame.sequence, frame.timing, perception)
+        if perception.segmentation.mask.size <= SMALL_MASK_CELLS:
+            return code()
+        return await asyncio.get_running_loop().run_in_executor(self._executor, code)
