@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 from typing import Annotated
 
 import typer
 
+from cable_rpc.cli.logging_options import LogFormatOption, LogLevelOption, set_up_logging
 from cable_rpc.cli.serve_cluster import (
     Engine,
     EngineChoice,
@@ -42,6 +42,7 @@ from cable_rpc.cli.serve_security import (
     check_exposure,
 )
 from cable_rpc.errors import ConfigurationError
+from cable_rpc.structured_log import LogFormat
 from cable_rpc.wire.address import is_loopback
 
 
@@ -94,6 +95,8 @@ def serve(
     ] = 30.0,
     metrics_listen: MetricsListen = "",
     reflection: Reflection = None,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    log_level: LogLevelOption = None,
     insecure: Annotated[
         bool,
         typer.Option(
@@ -116,10 +119,11 @@ def serve(
     --tokens tokens.txt[/bold]; docs/security.md shows how to make them. Without pruning of tokens:
     [bold]--segmenter 'lisa:FOLDER?image_tokens=all&sam_windows=all'[/bold]
     """
+    voice = set_up_logging(log_format, log_level)
     proof = tokens is not None or tls_client_ca is not None
     exposure = check_exposure(listen, tls=tls_cert is not None, proof=proof, insecure=insecure)
     if exposure is not None:
-        print(f"cable-rpc: {exposure}", file=sys.stderr)
+        voice.warn(exposure)
     try:
         import onnxruntime  # noqa: F401 - asked for here so that its absence gets a sentence
     except ModuleNotFoundError as error:
@@ -195,4 +199,4 @@ def serve(
         metrics_address=metrics_listen,
         reflection=(proof or is_loopback(listen)) if reflection is None else reflection,
     )
-    asyncio.run(serve_until_signal(settings.load(), config, announce=lambda line: print(line, flush=True)))
+    asyncio.run(serve_until_signal(settings.load(), config, voice.announce))

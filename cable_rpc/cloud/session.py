@@ -32,6 +32,7 @@ from cable_rpc.cloud.stream_decoder import DecodedFrame, FrameRejection, StreamD
 from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.throttled_log import ThrottledWarning
 from cable_rpc.errors import CableError, ProtocolError, Refusal
+from cable_rpc.structured_log import label_client, label_stream
 from cable_rpc.wire.convert import PROTOCOL_REVISION, status_of
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
@@ -96,6 +97,7 @@ class PerceptionSession:
     async def run(self, requests: Requests) -> AsyncGenerator[Response, None]:
         """Serves the stream until the client ends it, breaks a rule, or `drain` is called."""
         self._telemetry.stream_opened()
+        label_stream(self.session_id, self.identity.name)
         self._tasks = [asyncio.create_task(self._read_all(requests)), asyncio.create_task(self._infer_newest())]
         try:
             while (response := await self._next_response()) is not None:
@@ -229,6 +231,7 @@ class PerceptionSession:
         self._state.task = hello.task_config
         self._token = self._store.enter(self, self._token)
         self._heard_s = time.monotonic()
+        label_client(self.session_id, hello.client_id)
         log.info(
             "session %s of %s%s: %s %s %dx%d",
             self.session_id,
