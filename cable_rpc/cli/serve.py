@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Annotated
 
 import typer
@@ -41,6 +42,7 @@ from cable_rpc.cli.serve_security import (
     Tokens,
     check_exposure,
 )
+from cable_rpc.cli.tracing_options import Otlp, server_spans
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.structured_log import LogFormat
 from cable_rpc.wire.address import is_loopback
@@ -97,6 +99,7 @@ def serve(
     reflection: Reflection = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     log_level: LogLevelOption = None,
+    otlp: Otlp = "",
     insecure: Annotated[
         bool,
         typer.Option(
@@ -199,4 +202,5 @@ def serve(
         metrics_address=metrics_listen,
         reflection=(proof or is_loopback(listen)) if reflection is None else reflection,
     )
-    asyncio.run(serve_until_signal(settings.load(), config, voice.announce))
+    with server_spans(otlp) as spans:
+        asyncio.run(serve_until_signal(settings.load(), replace(config, spans=spans), voice.announce))

@@ -7,6 +7,7 @@ import importlib.util
 import math
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,7 @@ from cable_rpc.cli.connection_options import (
 from cable_rpc.cli.progress import RunProgress
 from cable_rpc.cli.roi_options import region_treatment, roi_config
 from cable_rpc.cli.skip_bad import SkipBad, bad_frames_listed
+from cable_rpc.cli.tracing_options import Otlp, TraceEvery, edge_tracing
 from cable_rpc.data.bad_frames import BadFrames
 from cable_rpc.data.source import SOURCE_FORMS, FrameSource, open_source
 from cable_rpc.edge.channel import SecureTarget
@@ -138,6 +140,8 @@ def stream(
         ),
     ] = True,
     skip_bad: SkipBad = False,
+    trace_every: TraceEvery = None,
+    otlp: Otlp = "",
 ) -> None:
     """Stream a camera through the loop and measure what it costs.
 
@@ -177,7 +181,7 @@ def stream(
         security=security,
         command_line=shlex.join(["cable-rpc", *sys.argv[1:]]),
     )
-    with bad_frames_listed(skip_bad) as bad_frames:
+    with bad_frames_listed(skip_bad) as bad_frames, edge_tracing(otlp, trace_every) as tracing:
         opened = open_source(
             source,
             max_frames=frames,
@@ -188,7 +192,7 @@ def stream(
             mount=camera_mount(camera_height, camera_pitch),
             bad_frames=bad_frames,
         )
-        run_and_report(opened, config)
+        run_and_report(opened, replace(config, tracing=tracing))
 
 
 def run_and_report(source: FrameSource, config: StreamRunConfig) -> None:

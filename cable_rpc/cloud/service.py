@@ -20,6 +20,7 @@ from grpc_reflection.v1alpha import reflection
 
 from cable_rpc.cloud.admission import AdmissionControl
 from cable_rpc.cloud.authentication import AuthenticationInterceptor, Authenticator, current_identity
+from cable_rpc.cloud.frame_trace import StreamTracer
 from cable_rpc.cloud.limits import ServerLimits
 from cable_rpc.cloud.metrics import ServerMetrics
 from cable_rpc.cloud.metrics_endpoint import MetricsEndpoint
@@ -33,6 +34,7 @@ from cable_rpc.cloud.telemetry import NOBODY, Telemetry
 from cable_rpc.cloud.tls import RenewingCredentials, TlsFiles
 from cable_rpc.cloud.tokens import AccessFile
 from cable_rpc.errors import ConfigurationError, Refusal
+from cable_rpc.tracing.spans import SpanSink
 from cable_rpc.wire.channel import MAX_MESSAGE_BYTES, server_options
 from cable_rpc.wire.convert import status_of
 from cable_rpc.wire.v1 import perception_pb2 as pb
@@ -73,6 +75,8 @@ class ServerConfig:
     """Where clients are sent when this server stops; empty = they come back here."""
     metrics_address: str = ""
     """host:port for Prometheus and HTTP probes; empty = none."""
+    spans: SpanSink | None = None
+    """Takes the spans of frames that clients trace; None = they are not traced here."""
     reflection: bool = True
     """The contract is told to those who ask for it by gRPC's server reflection."""
 
@@ -105,13 +109,18 @@ class PerceptionService(pb_grpc.PerceptionServiceServicer):
             telemetry=self._telemetry,
             store=self._store,
         )
+        spans = self._config.spans
+        tracer = None if spans is None else StreamTracer(request_iterator, spans)
         self._sessions.add(session)
         self._idle.clear()
         try:
-            async with aclosing(session.run(request_iterator)) as responses:
+            async with aclosing(session.run(tracer or request_iterator)) as responses:
                 async for response in responses:
+                    handed_over_ns = time.monotonic_ns()
                     async with asyncio.timeout(self._config.write_timeout_s):
                         await context.write(response)
+                    if tracer is not None:
+                        tracer.written(response, session.session_id, handed_over_ns)
         except TimeoutError:
             log.warning("session %s: the client takes no answers", session.session_id)
             await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, "answers were not taken in time")

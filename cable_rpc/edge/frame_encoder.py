@@ -21,6 +21,7 @@ from cable_codecs import (
 from cable_rpc.edge.capture import CapturedFrame
 from cable_rpc.edge.proposal import RoiProposal
 from cable_rpc.edge.strategy import RoiStrategy
+from cable_rpc.tracing.context import SpanContext
 from cable_rpc.types import RoiMask
 from cable_rpc.wire.convert import ego_to_message, region_to_message
 from cable_rpc.wire.v1 import perception_pb2 as pb
@@ -38,6 +39,10 @@ class PreparedFrame:
     """What was sent: the proposal's region as treated, or the whole frame."""
     roi_ns: int
     fill_ns: int
+    started_time_ns: int
+    """When its preparation began, monotonic clock."""
+    encoded_time_ns: int
+    """When it was coded, monotonic clock."""
 
     @property
     def index(self) -> int:
@@ -57,14 +62,21 @@ class FrameEncoder:
         strategy: chooses the region.
         parameters: of the codec; with ``bitrate_kbps`` image codecs are kept at that rate by their quality.
         treatment: what becomes of regions; None takes what measured best for the codec.
+        trace_every: one of so many frames is marked to be traced, the first among them; 0 = none.
 
     Raises:
         CodecError: the codec can't be opened, or can't carry pictures treated so.
     """
 
     def __init__(
-        self, strategy: RoiStrategy, parameters: CodecParameters, treatment: RegionTreatment | None = None
+        self,
+        strategy: RoiStrategy,
+        parameters: CodecParameters,
+        treatment: RegionTreatment | None = None,
+        trace_every: int = 0,
     ) -> None:
+        self._trace_every = trace_every
+        self._prepared = 0
         self.strategy = strategy
         self._is_still = parameters.name in STILL_CODECS
         self.treatment = RegionTreatment.default_for(stateless=self._is_still) if treatment is None else treatment
@@ -113,6 +125,7 @@ class FrameEncoder:
         packet = self._encoder.encode(
             frame.image, None if whole else region.blocks, region.block_size, keyframe=force_keyframe
         )
+        encoded_ns = time.monotonic_ns()
         if self._rate is not None:
             self._rate.coded(len(packet.encoded.data))
         message = self._message(captured, proposal, packet, roi_ns)
@@ -122,11 +135,19 @@ class FrameEncoder:
             sent = RoiMask(packet.blocks, packet.block_size, *frame.size_hw)
             message.region.CopyFrom(region_to_message(sent))
         self.last_index = frame.index
-        return PreparedFrame(captured, proposal, packet.encoded, message, sent, roi_ns, packet.treat_ns)
+        return PreparedFrame(
+            captured, proposal, packet.encoded, message, sent, roi_ns, packet.treat_ns, started_ns, encoded_ns
+        )
 
     def close(self) -> None:
         """Frees the codec."""
         self._encoder.close()
+
+    def _traceparent(self) -> str:
+        """What begins a trace of the next frame; empty where it is not its turn."""
+        is_due = self._trace_every > 0 and self._prepared % self._trace_every == 0
+        self._prepared += 1
+        return SpanContext.new_trace().to_traceparent() if is_due else ""
 
     def _message(
         self, captured: CapturedFrame, proposal: RoiProposal, packet: TreatedPacket, roi_ns: int
@@ -138,6 +159,7 @@ class FrameEncoder:
             data=encoded.data,
             keyframe=encoded.keyframe,
             whole_frame=proposal.keyframe,
+            traceparent=self._traceparent(),
             timing=pb.EdgeTiming(
                 capture_ns=captured.capture_ns,
                 roi_ns=roi_ns,

@@ -22,6 +22,7 @@ from cable_rpc.edge.capture import Capture
 from cable_rpc.edge.channel import PLAIN, ClientSecurity
 from cable_rpc.edge.client import PerceptionClient, SessionRequest
 from cable_rpc.edge.frame_encoder import FrameEncoder
+from cable_rpc.edge.frame_trace import NOT_TRACED, EdgeTracing
 from cable_rpc.edge.resuming_client import Report, ResumingClient
 from cable_rpc.edge.roi_config import RoiConfig
 from cable_rpc.edge.strategy import FullFrame
@@ -84,6 +85,8 @@ class StreamRunConfig:
     notes: tuple[str, ...] = ()
     security: ClientSecurity = PLAIN
     """TLS and token of the way to the server."""
+    tracing: EdgeTracing = NOT_TRACED
+    """Of the frames of the first pass."""
 
 
 class StreamRun:
@@ -164,7 +167,7 @@ class StreamRun:
         with FrameCsvWriter(config.out / FRAMES_FILE) as csv:
             async with self._lasting_session() as client:
                 self._describe(client)
-                encoder = FrameEncoder(strategy, self._parameters, self._treatment)
+                encoder = FrameEncoder(strategy, self._parameters, self._treatment, config.tracing.every)
                 if encoder.fallback_reason is not None:
                     self._note(f"Encoder: {encoder.fallback_reason}.")
                 streamer = EdgeStreamer(capture, encoder, client)
@@ -172,6 +175,7 @@ class StreamRun:
                     async with aclosing(streamer.run()) as streamed_frames:
                         async for streamed in streamed_frames:
                             evidence = record_of(streamed, client.clock_offset)
+                            config.tracing.frame_done(streamed, client.clock_offset)
                             spool.append(streamed.prepared.encoded.data)
                             self._evidence.append(evidence)
                             csv.write(evidence.record)
