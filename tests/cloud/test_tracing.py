@@ -104,12 +104,13 @@ def check_trace(trace: list[tuple[str, Any]]) -> None:
     parents = {name: by_id[span.parent_span_id].name for name, span in spans.items() if span.parent_span_id in by_id}
     assert parents["perceive"] == parents["uplink"] == parents["downlink"] == "round trip"
     assert {parents[name] for name in SERVER_SPANS - {"perceive"}} == {"perceive"}
+    (clock_error_ns,) = (entry.value.int_value for entry in spans["uplink"].attributes)
     in_order = [
         "capture", "edge_wait", "roi", "fill", "encode", "send", "uplink", "decode", "detect", "segment", "downlink",
         "apply",
     ]  # fmt: skip
     for before, after in itertools.pairwise(in_order):
-        slack_ns = 200_000 if {before, after} & {"uplink", "downlink"} else 0
+        slack_ns = 200_000 + clock_error_ns if {before, after} & {"uplink", "downlink"} else 0
         assert spans[before].end_time_unix_nano <= spans[after].start_time_unix_nano + slack_ns, (before, after)
 
 
