@@ -167,7 +167,9 @@ def serve(
             tokens=str(tokens.resolve()) if tokens is not None else "",
         )
         host = ClusterHost(port, ray_address=ray_address, proxy=ray_proxy.value)
-        serve_on_cluster(cluster, host, announce=lambda line: print(line, flush=True))
+        if otlp:
+            raise ConfigurationError("--otlp is for the in-process engine: the replicas of --engine ray tell no spans")
+        serve_on_cluster(cluster, host, voice.announce)
         return
     tls = TlsFiles.from_flags(tls_cert, tls_key, tls_client_ca)
     # Loading models takes long; what is wrong with the files is said before.
