@@ -14,7 +14,7 @@ import typer
 from cable_rpc.structured_log import LogFormat, configure_logging
 
 PANEL = "Operations"
-log = logging.getLogger(__name__)
+log = logging.getLogger("cable_rpc")
 
 
 class LogLevel(StrEnum):

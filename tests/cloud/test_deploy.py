@@ -91,6 +91,16 @@ def test_the_dashboard_asks_for_what_there_is(deploy: Path, exposed: dict[str, s
     assert query == "label_values(cable_build_info, instance)"
 
 
+def test_the_documents_list_every_metric(repository: Path, exposed: dict[str, set[str]]) -> None:
+    rows = [
+        line.split("|") for line in (repository / "docs" / "operations.md").read_text().splitlines()
+        if line.startswith("| `cable_")
+    ]  # fmt: skip
+    listed = {re.findall(r"\w+", cells[1])[0]: set(re.findall(r"`(\w+)`", cells[3])) for cells in rows}
+    base = {re.sub(r"_(bucket|sum|count)$", "", name): labels - {"le"} for name, labels in exposed.items()}
+    assert listed == {name: labels for name, labels in base.items() if not name.endswith("_created")}
+
+
 def test_panels_do_not_overlap(deploy: Path) -> None:
     panels = json.loads((deploy / "grafana" / "cable-rpc.json").read_text())["panels"]
     assert len({panel["id"] for panel in panels}) == len(panels)
