@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
-BARRED_ON_THE_EDGE = ("torch", "transformers", "onnxruntime", "onnx", "plotly", "jinja2", "skimage", "cable_models")
+BARRED_ON_THE_EDGE = (
+    "torch", "transformers", "onnxruntime", "onnx", "plotly", "jinja2", "skimage", "cable_models", "opentelemetry",
+    "prometheus_client",
+)  # fmt: skip
 
 
 def run(repository: Path, *command: str) -> subprocess.CompletedProcess[str]:
@@ -78,6 +81,7 @@ def imported_packages(path: Path) -> set[str]:
         ("models/cable_models", ("cable_rpc", "cable_codecs", "grpc")),
         ("cable_rpc/edge", ("cable_rpc.cloud", "cable_rpc.study", "cable_rpc.cli", "cable_models")),
         ("cable_rpc/wire", ("cable_rpc.cloud", "cable_rpc.edge", "cable_rpc.study", "cable_rpc.data")),
+        ("cable_rpc/tracing", ("cable_rpc.cloud", "cable_rpc.edge", "cable_rpc.study", "cable_rpc.cli")),
         ("cable_rpc/data", ("cable_rpc.cloud", "cable_rpc.edge", "cable_rpc.study", "cable_rpc.wire")),
         ("cable_rpc/cloud", ("cable_rpc.edge", "cable_rpc.study", "cable_rpc.cli")),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,16 +14,24 @@ from typing import Any
 
 import grpc
 import pytest
+from cable_codecs import CodecParameters
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cable_rpc.cli.tracing_options import edge_tracing, server_spans
 from cable_rpc.cloud.frame_trace import AnsweredFrame, StreamTracer
-from cable_rpc.edge.frame_trace import EdgeTracing
+from cable_rpc.edge.capture import CapturedFrame
+from cable_rpc.edge.frame_encoder import FrameEncoder
+from cable_rpc.edge.frame_trace import EdgeTracing, spans_of
+from cable_rpc.edge.strategy import FullFrame
+from cable_rpc.edge.streamer import StreamedFrame
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.study.stream_run import StreamRun, StreamRunConfig
 from cable_rpc.tracing.context import SpanContext
 from cable_rpc.tracing.otlp import ProcessorSink, open_otlp
 from cable_rpc.tracing.spans import Span
+from cable_rpc.wire.answers import FrameAnswer
+from cable_rpc.wire.clock import ClockOffset
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
 from .conftest import FailingSegmenter
@@ -245,6 +254,41 @@ def test_spans_arrive_in_the_sdk_as_they_are() -> None:
     assert dict(span.attributes or {}) == {"cable.sequence": 3}
     assert span.status.description == "late"
     assert span.resource.attributes["service.name"] == "a service"
+
+
+def test_a_lost_frame_has_no_way_through_the_network(tmp_path: Path) -> None:
+    lost = streamed_frame(FrameAnswer.lost(3, "the server vanished"))
+    spans = {span.name: span for span in spans_of(lost, ClockOffset(7, 1), wall_offset_ns=0)}
+    assert not {"uplink", "downlink"} & set(spans)
+    assert spans["frame"].error == spans["round trip"].error == "LOST: the server vanished"
+
+
+def streamed_frame(answer: FrameAnswer) -> StreamedFrame:
+    (frame,) = MovingSquare(1)
+    encoder = FrameEncoder(FullFrame(), CodecParameters("jpeg", 160, 96, 10.0), trace_every=1)
+    prepared = encoder.prepare(CapturedFrame(frame, 5, time.monotonic_ns()), force_keyframe=False)
+    encoder.close()
+    return StreamedFrame(prepared, answer, 1, time.monotonic_ns())
+
+
+def test_one_of_so_many_frames_is_marked() -> None:
+    encoder = FrameEncoder(FullFrame(), CodecParameters("jpeg", 160, 96, 10.0), trace_every=3)
+    marks = [
+        encoder.prepare(CapturedFrame(frame, 0, 0), force_keyframe=False).message.traceparent
+        for frame in MovingSquare(7)
+    ]
+    encoder.close()
+    assert [bool(mark) for mark in marks] == [True, False, False, True, False, False, True]
+    assert len(set(marks)) == 4, "each frame has a trace of its own"
+
+
+def test_a_vehicle_can_mark_frames_without_a_collector() -> None:
+    with edge_tracing("", None) as nothing, edge_tracing("", 5) as marked, edge_tracing("127.0.0.1:1", None) as usual:
+        assert nothing == EdgeTracing(0)
+        assert marked == EdgeTracing(5)
+        assert (usual.every, usual.sink is None) == (30, False)
+    with server_spans("") as sink:
+        assert sink is None
 
 
 @pytest.fixture
