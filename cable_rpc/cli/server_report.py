@@ -39,6 +39,7 @@ def report_lines(report: ServerReport) -> list[str]:
     return [
         f"{report.address}: {report.version}, {'TLS' if report.tls else 'plain text'}, "
         f"{report.round_trip_ms:.1f} ms there and back",
+        f"  health   {report.health}",
         f"  models   {', '.join(report.models) or 'none'}",
         f"  codecs   {', '.join(report.codecs) or 'none'}",
         f"  grants   {report.max_in_flight} frames in flight of up to {report.max_frame_bytes} bytes "

@@ -18,6 +18,10 @@ from cable_rpc.wire.v1 import perception_pb2_grpc as pb_grpc
 
 ROUND_TRIPS = 5
 
+HEALTH_CHECK = "/grpc.health.v1.Health/Check"
+HEALTH_ANSWERS = {b"\x08\x01": "serving", b"\x08\x02": "not serving"}
+"""HealthCheckResponse as serialised; its stubs come with the cloud extra, which an edge box does not have."""
+
 
 @dataclass(frozen=True, slots=True)
 class ServerReport:
@@ -33,6 +37,8 @@ class ServerReport:
     max_pixels: int
     round_trip_ms: float
     """Shortest of five small calls."""
+    health: str
+    """ "serving", "not serving" from the first moment of a drain, "unknown" where the server does not tell."""
 
 
 async def ask_server(way: SecureTarget, timeout_s: float) -> ServerReport:
@@ -49,6 +55,7 @@ async def ask_server(way: SecureTarget, timeout_s: float) -> ServerReport:
             async with asyncio.timeout(timeout_s):
                 await way.wait_until_ready(channel)
                 info = await stub.GetServerInfo(pb.GetServerInfoRequest(), metadata=way.metadata)
+                health = await health_of(channel)
                 trips_ns = [await round_trip_ns(stub, way) for _ in range(ROUND_TRIPS)]
         except TimeoutError:
             raise RemoteError(f"no answer from {way.address} within {timeout_s:g} s") from None
@@ -64,7 +71,19 @@ async def ask_server(way: SecureTarget, timeout_s: float) -> ServerReport:
         info.flow.max_frame_bytes,
         info.max_pixels,
         min(trips_ns) / 1e6,
+        health,
     )
+
+
+async def health_of(channel: grpc.aio.Channel) -> str:
+    """What gRPC's standard health service says of the whole server."""
+    check: Any = channel.unary_unary(HEALTH_CHECK)
+    try:
+        return HEALTH_ANSWERS.get(await check(b""), "unknown")
+    except grpc.aio.AioRpcError as error:
+        if error.code() in {grpc.StatusCode.UNIMPLEMENTED, grpc.StatusCode.NOT_FOUND}:
+            return "unknown"
+        raise
 
 
 async def round_trip_ns(stub: Any, way: SecureTarget) -> int:
