@@ -10,18 +10,16 @@ import sys
 from collections.abc import Iterator, Mapping
 
 from google.rpc import code_pb2
-from prometheus_client import CollectorRegistry, Counter, Gauge
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 import cable_rpc
-from cable_rpc.cloud.tallies import TallyHistogram
 from cable_rpc.cloud.telemetry import Telemetry
 from cable_rpc.wire.v1 import perception_pb2 as pb
 
 SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 BATCH_SIZES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-MODELS = ("detect", "segment")
 STAGES = ("decode_wait", "decode", "detect_wait", "detect", "segment_wait", "segment", "server")
 """Of an answered frame; ``server`` is all of its time here."""
 OUTCOMES = {number: name.removeprefix("REJECT_REASON_").lower() for name, number in pb.RejectReason.items()}
@@ -51,14 +49,16 @@ class ServerMetrics(Telemetry):
         self._up_video, self._up_region, self._up_rest = (up.labels(layer) for layer in ("video", "region", "rest"))
         down = Counter("cable_downlink_bytes", "Bytes of messages sent", ["layer"], registry=registry)
         self._down_mask, self._down_rest = (down.labels(layer) for layer in ("mask", "rest"))
-        stages = TallyHistogram("cable_stage_seconds", "Time of an answered frame", "stage", STAGES, SECONDS)
-        batches = TallyHistogram("cable_batch_frames", "Frames in one run of a model", "model", MODELS, BATCH_SIZES)
-        runs = TallyHistogram("cable_batch_seconds", "Time of one run of a model", "model", MODELS, SECONDS)
-        for histogram in (stages, batches, runs):
-            registry.register(histogram)
-        self._batches, self._runs, stage = batches.tallies, runs.tallies, stages.tallies
-        self._decode_wait, self._decode, self._server = stage["decode_wait"], stage["decode"], stage["server"]
-        self._models = {model: (stage[f"{model}_wait"], stage[model]) for model in MODELS}
+        stages = Histogram(
+            "cable_stage_seconds", "Time of an answered frame", ["stage"], buckets=SECONDS, registry=registry
+        )
+        self._stages = {stage: stages.labels(stage) for stage in STAGES}
+        self._batches = Histogram(
+            "cable_batch_frames", "Frames in one run of a model", ["model"], buckets=BATCH_SIZES, registry=registry
+        )
+        self._runs = Histogram(
+            "cable_batch_seconds", "Time of one run of a model", ["model"], buckets=SECONDS, registry=registry
+        )
         self._keyframe_requests = Counter(
             "cable_keyframe_requests", "Times a decoder asked for a keyframe", registry=registry
         )
@@ -106,23 +106,25 @@ class ServerMetrics(Telemetry):
 
     def batch_done(self, model: str, size: int, run_ns: int) -> None:
         """See `Telemetry`."""
-        self._batches[model].observe(size)
-        self._runs[model].observe(run_ns / 1e9)
+        self._batches.labels(model).observe(size)
+        self._runs.labels(model).observe(run_ns / 1e9)
 
     def authentication_failed(self) -> None:
         """See `Telemetry`."""
         self._authentication_failures.inc()
 
     def _observe(self, timing: pb.ServerTiming) -> None:
-        self._decode_wait.observe(timing.decode_wait_ns / 1e9)
-        self._decode.observe(timing.decode_ns / 1e9)
-        self._server.observe((timing.send_time_ns - timing.receive_time_ns) / 1e9)
+        took: dict[str, int] = {
+            "decode_wait": timing.decode_wait_ns,
+            "decode": timing.decode_ns,
+            "server": timing.send_time_ns - timing.receive_time_ns,
+        }
         for stage in timing.stages:
-            model = self._models.get(stage.stage)
-            if model is not None:
-                waiting, running = model
-                waiting.observe(stage.wait_ns / 1e9)
-                running.observe(stage.run_ns / 1e9)
+            if stage.stage in self._stages:
+                took[stage.stage] = stage.run_ns
+                took[f"{stage.stage}_wait"] = stage.wait_ns
+        for name, took_ns in took.items():
+            self._stages[name].observe(took_ns / 1e9)
 
 
 class MemoryCollector(Collector):
