@@ -19,6 +19,7 @@ from cable_rpc.cli.serve_cluster import (
     ReplicaGpus,
     Replicas,
     cluster_port,
+    refuse_in_process_options,
 )
 from cable_rpc.cli.serve_operations import MetricsListen, Reflection
 from cable_rpc.cli.serve_scheduling import (
@@ -152,6 +153,17 @@ def serve(
         latency_bound_s=latency_bound,
     )
     if engine is Engine.RAY:
+        refuse_in_process_options(
+            {
+                "--otlp": otlp,
+                "--metrics-listen": metrics_listen,
+                "--drain-to": drain_to,
+                "--identity-streams": identity_streams,
+                "--identity-frames-per-s": identity_frames_per_s,
+                "--identity-pixels-per-s": identity_pixels_per_s,
+                "--identity-bytes-per-s": identity_bytes_per_s,
+            }
+        )
         from cable_rpc.cloud.cluster.host import ClusterHost, serve_on_cluster
         from cable_rpc.cloud.cluster.settings import ClusterSettings, ReplicaSettings
 
@@ -167,8 +179,6 @@ def serve(
             tokens=str(tokens.resolve()) if tokens is not None else "",
         )
         host = ClusterHost(port, ray_address=ray_address, proxy=ray_proxy.value)
-        if otlp:
-            raise ConfigurationError("--otlp is for the in-process engine: the replicas of --engine ray tell no spans")
         serve_on_cluster(cluster, host, voice.announce)
         return
     tls = TlsFiles.from_flags(tls_cert, tls_key, tls_client_ca)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Annotated
 
@@ -80,3 +81,19 @@ def cluster_port(listen: str, *, tls: bool, insecure: bool) -> int:
     if not port.isdigit() or not 0 < int(port) < 65536:
         raise ConfigurationError(f"--listen {listen}: a cluster needs a port of 1 to 65535")
     return int(port)
+
+
+def refuse_in_process_options(given: Mapping[str, object]) -> None:
+    """Options that replicas don't heed are not passed over in silence.
+
+    Args:
+        given: names of such options and what was given; what is empty was not given.
+
+    Raises:
+        ConfigurationError: one was given.
+    """
+    names = [name for name, value in given.items() if value]
+    if names:
+        raise ConfigurationError(
+            f"{', '.join(names)}: only for the in-process engine; docs/cluster.md tells what --engine ray has instead"
+        )

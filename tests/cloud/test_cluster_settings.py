@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import yaml
 
-from cable_rpc.cli.serve_cluster import cluster_port
+from cable_rpc.cli.serve_cluster import cluster_port, refuse_in_process_options
 from cable_rpc.cloud.cluster.settings import ClusterSettings, ReplicaSettings
 from cable_rpc.errors import ConfigurationError
 from cable_rpc.wire.channel import MAX_MESSAGE_BYTES
@@ -83,3 +83,9 @@ def test_a_cluster_listens_openly_only_when_told_to() -> None:
         cluster_port("0.0.0.0:50051", tls=True, insecure=True)
     with pytest.raises(ConfigurationError, match="port of 1 to 65535"):
         cluster_port("0.0.0.0:0", tls=False, insecure=True)
+
+
+def test_options_that_replicas_would_ignore_are_refused() -> None:
+    refuse_in_process_options({"--otlp": "", "--identity-streams": None})
+    with pytest.raises(ConfigurationError, match=r"--otlp, --drain-to: only for the in-process engine"):
+        refuse_in_process_options({"--otlp": "localhost:4317", "--metrics-listen": "", "--drain-to": "b:1"})
