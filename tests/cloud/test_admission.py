@@ -165,7 +165,11 @@ async def test_many_more_calls_than_places_are_refused_by_the_transport(stub_for
                 codes.append(await call.code())
         assert codes.count("welcome") == 2
         assert codes.count("closing") == 16
-        assert codes.count(grpc.StatusCode.RESOURCE_EXHAUSTED) == 22
+        refused = [code for code in codes if isinstance(code, grpc.StatusCode)]
+        assert len(refused) == 22
+        # A call that is refused while the client writes can report INTERNAL in place of its status (grpc #36066).
+        assert set(refused) <= {grpc.StatusCode.RESOURCE_EXHAUSTED, grpc.StatusCode.INTERNAL}
+        assert grpc.StatusCode.RESOURCE_EXHAUSTED in refused
         assert len(server._service._sessions) == 18
         for call in calls:
             call.cancel()
